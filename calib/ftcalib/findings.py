@@ -253,7 +253,6 @@ _REJECT: Final = ("reject",)
 _LIMIT: Final = ("limit",)
 _NOTE: Final = ("note",)
 _REJECT_OR_LIMIT: Final = ("reject", "limit")
-_REJECT_OR_NOTE: Final = ("reject", "note")
 _LIMIT_OR_NOTE: Final = ("limit", "note")
 
 # fmt: off

@@ -10,8 +10,7 @@ class SensorKind:
     """One kind of sensor: the properties that are known before its driver is imported."""
 
     driver: str
-    """Module and class of the driver. The class has `from_url`, on CAN also `probe`; on a serial port the module has
-    `SERIAL_PROBES`."""
+    """Module and class of the driver; docs/how-to/add-a-sensor.md describes what they must have."""
     wire: Literal["can", "serial", "ethernet", "topic"]
     emulated: Mapping[str, str] = field(default_factory=dict)
     """Name of each emulator of this sensor, and its description for the user."""

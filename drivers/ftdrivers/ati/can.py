@@ -22,7 +22,7 @@ from ftdrivers.interfaces import Array, DeviceInfo, FtSamples
 from ftdrivers.registry import Options, join_url
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from ftdrivers.wires.can_bus import CanBus, CanFrame, CanProbe, join_frames
-from ftdrivers.wires.framing import describe_status
+from ftdrivers.wires.framing import ENOUGH_FRAMES, describe_status
 
 log = logging.getLogger(__name__)
 
@@ -129,7 +129,7 @@ class AtiCanSensor(StreamingSensor):
         def recognize(heard: Sequence[CanFrame]) -> str | None:
             request = (first | Op.GAUGES, b"")
             ours = [frame for frame in heard if frame[0] in own and frame != request]
-            return "another host reads it" if len(join_frames(ours, replies(Op.GAUGES))) >= 5 else None
+            return "another host reads it" if len(join_frames(ours, replies(Op.GAUGES))) >= ENOUGH_FRAMES else None
 
         def ask(bus: CanBus) -> str | None:
             serial = bus.request(first | Op.SERIAL, b"", replies(Op.SERIAL))

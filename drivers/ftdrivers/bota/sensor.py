@@ -222,8 +222,7 @@ class BotaSensor(StreamingSensor):
 
 
 def _boot_url(data: bytes) -> str | None:
-    baud = codec.find_baud(data)
-    return None if baud is None else f"bota://{{port}}?baud={baud}"
+    return None if (baud := codec.find_baud(data)) is None else f"bota://{{port}}?baud={baud}"
 
 
 SERIAL_PROBES = (

@@ -14,6 +14,7 @@ from ftdrivers.robotous import codec
 from ftdrivers.robotous.codec import Command, Field
 from ftdrivers.robotous.sensor import RobotousSensor
 from ftdrivers.wires.can_bus import CanBus, CanFrame, CanProbe, join_frames
+from ftdrivers.wires.framing import ENOUGH_FRAMES
 
 # Silence between two fields, s, at most half a period. The halves of one field follow each other directly.
 _SILENCE_S = 0.002
@@ -209,7 +210,7 @@ class RobotousCan(RobotousSensor):
             except ProtocolError:
                 return None
             plausible = all(sample.overload < 0x40 for sample in samples)
-            return "it streams" if plausible and len(samples) >= 5 else None
+            return "it streams" if plausible and len(samples) >= ENOUGH_FRAMES else None
 
         def ask(bus: CanBus) -> str | None:
             field = bus.request(command, codec.encode(Command.MODEL), reply)

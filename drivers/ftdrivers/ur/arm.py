@@ -335,7 +335,7 @@ class UrArm(RobotArm):
         `guard` is called about 100 times per second. Each of these exceptions stops the arm before it is raised:
         `DeviceFault` (protective, emergency or safeguard stop, program ended, arm not at the goal), `StreamBroken`,
         `DeviceTimeout` (silent controller, or `timeout_s` has passed), an exception of the guard, KeyboardInterrupt.
-        A safety stop is never reset. After a failure the control program is ended, so nobody can resume the move.
+        A safety stop is never reset. After a failure the control program is ended, so the move cannot be resumed.
         """
         q = _joints(q_rad)
         speed = self._speed_rad_s if speed_rad_s is None else float(speed_rad_s)

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Mapping
 
+ENOUGH_FRAMES = 5  # number of correct messages in a row that identify the stream of a sensor
+
 
 def _table(polynomial: int) -> tuple[int, ...]:
     def entry(byte: int) -> int:
@@ -107,8 +109,8 @@ class Deframer:
 
 
 def is_stream(deframer: Callable[[], Deframer]) -> Callable[[bytes], bool]:
-    """Return a function that checks whether bytes contain at least five intact frames, enough to identify a stream."""
-    return lambda data: len(deframer().feed(data)) >= 5
+    """Return a function that checks whether bytes contain enough intact frames to identify a stream."""
+    return lambda data: len(deframer().feed(data)) >= ENOUGH_FRAMES
 
 
 def describe_status(status: int, bits: Mapping[int, str], width: int = 16) -> str:

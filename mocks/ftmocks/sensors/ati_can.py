@@ -94,8 +94,9 @@ class AtiCanNode(CanSensor):
         self._slot = 0
         self._booted_s = 0.0
 
-    def _power_up(self) -> None:
-        super()._power_up()
+    def power_up(self) -> None:
+        """See `Device`."""
+        super().power_up()
         self._booted_s = 0.0
 
     def _boot(self) -> None:

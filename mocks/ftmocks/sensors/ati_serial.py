@@ -134,7 +134,8 @@ class AtiSerialBox(ModbusSensor):
         self._registers: dict[int, int] = {}
         self._unlocked = False
 
-    def _power_up(self) -> None:
+    def power_up(self) -> None:
+        """See `Device`."""
         self._registers = dict.fromkeys(range(GAINS, SESSION + 1), 0)
         self._registers |= {BAUD_STORE: 0, BAUD: self._stored_baud_code}
         for slot in range(1, CALIBRATION_SLOTS + 1):

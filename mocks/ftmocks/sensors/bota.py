@@ -131,7 +131,8 @@ class BotaBox(SerialSensor):
     def _settings(self) -> tuple[int, int, bool, bool]:
         return self.sinc_length, self._next_baud_code, self.csv, self.calibrated
 
-    def _power_up(self) -> None:
+    def power_up(self) -> None:
+        """See `Device`."""
         self._was_open = False
         self._restart()
         if self.streaming_at_start:

@@ -222,7 +222,8 @@ class NetFtBox(Device[bytes]):
         self._http.server_close()
         self._socket.close()
 
-    def _power_up(self) -> None:
+    def power_up(self) -> None:
+        """See `Device`."""
         self._wire.clear()
         self._pacer.stop()
         self._bias = np.array(self.bias, dtype=float)
@@ -259,7 +260,7 @@ class NetFtBox(Device[bytes]):
 
     def _deliver(self, frames: list[bytes]) -> None:
         for datagram in frames:
-            with contextlib.suppress(OSError):  # the buffer is full or nobody listens: the datagram is lost
+            with contextlib.suppress(OSError):  # the buffer is full or no client listens: the datagram is lost
                 if self._client is not None:
                     self._socket.sendto(datagram, self._client)
 

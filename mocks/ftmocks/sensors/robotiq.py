@@ -69,7 +69,8 @@ class RobotiqBox(ModbusSensor):
         self._output = 0
         self._stop_bytes = 0
 
-    def _power_up(self) -> None:
+    def power_up(self) -> None:
+        """See `Device`."""
         self._burst.clear()
         self._fall_silent()
         self._output = self._stop_bytes = 0

@@ -74,7 +74,8 @@ class RobotiqUrcap(Device[bytes]):
             client.close()
         self._clients.clear()
 
-    def _power_up(self) -> None:
+    def power_up(self) -> None:
+        """See `Device`."""
         self._wire.clear()
         self._pacer.start(STREAM_HZ)
 

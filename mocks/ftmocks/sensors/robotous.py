@@ -313,7 +313,8 @@ class RobotousSerialBox(RobotousSensor[bytes], SerialSensor):
     def _fastest_hz(self) -> float:
         return FASTEST_HZ[BAUD_RATES[self.baud_code]]
 
-    def _power_up(self) -> None:
+    def power_up(self) -> None:
+        """See `Device`."""
         self._line.clear()
         self._fall_silent()
         self.boot()

@@ -138,17 +138,13 @@ class Device(ABC, Generic[Frame]):
         if self._threads:
             os.write(self._wake_write, _RESET)
 
-    def power_up(self) -> None:
-        """Supply the device with power, as `start` does, without a wire."""
-        self._power_up()
-
     @abstractmethod
-    def _power_up(self) -> None:
+    def power_up(self) -> None:
         """Set the state after power-up."""
 
     def _restart(self) -> None:
         """Set the state after an interruption of the supply."""
-        self._power_up()
+        self.power_up()
 
     @abstractmethod
     def _receive(self) -> None:
@@ -198,7 +194,7 @@ class Device(ABC, Generic[Frame]):
     def _launch(self, *more: Callable[[], None]) -> None:
         """Power the device up and start its threads."""
         self._wake_read, self._wake_write = os.pipe()
-        self._power_up()
+        self.power_up()
         for target in (self._serve, *more):
             self._threads.append(threading.Thread(target=target, name=type(self).__name__, daemon=True))
             self._threads[-1].start()

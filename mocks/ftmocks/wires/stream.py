@@ -84,7 +84,8 @@ class CanSensor(PtyDevice[CanFrame]):
     def _foreign_frame(self, rng: random.Random) -> CanFrame:
         """Return another node's frame, which a careless client could take for a frame of the sensor."""
 
-    def _power_up(self) -> None:
+    def power_up(self) -> None:
+        """See `Device`."""
         self._adapter = SlcanAdapter()
         self._answers = b""
         self._wire.clear()

@@ -123,7 +123,7 @@ class Case:
     happens: Mapping[str, Action]
     """By the moment: see `at`."""
     resume: tuple[str, ...] = ()
-    """Answers in a hold; without one, nobody is there to resume."""
+    """Answers in a hold; if empty, there is no operator to resume."""
     answers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Answers to other questions, by words of theirs."""
     mode: str = "auto"
