@@ -14,6 +14,7 @@ def test_the_eleven_cases_come_from_one_command(ftdrive: CommandLine, monkeypatc
     perfect = Station(
         "robotous-serial",  # 200 Hz, which costs less of a core than a fast sensor
         ["--gain", "0", "--cross-talk", "0", "--noise", "0.02,0.0008"],
+        control_path="script",  # ur_rtde counts its time-outs in real time, which a busy computer exceeds
         values={"robot.speed_deg_s": 180.0, "robot.acceleration_deg_s2": 300.0},
     )
     monkeypatch.setattr(Station, "of", lambda *_: perfect)
