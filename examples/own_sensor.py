@@ -20,7 +20,7 @@ class AcmeSensor(ftdrivers.StreamingSensor):
         return ftdrivers.DeviceInfo(model="Acme FT", serial="A1", firmware="1.0")
 
     def _read_block(self) -> ftdrivers.FtSamples:
-        self._seq += 1  # counts every sample that the device sent, so that a lost one is a gap
+        self._seq += 1  # counts every sample that the device sent, so a lost one leaves a gap
         return ftdrivers.FtSamples.of(time.monotonic_ns(), self._seq, np.atleast_2d(self._read_wrench()))
 
     def _disconnect(self) -> None:

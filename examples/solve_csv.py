@@ -1,4 +1,4 @@
-"""Calibrate from a CSV file: one row a pose, with the orientation of the flange and the mean wrench."""
+"""Calibrate from a CSV file: one row per pose, with the orientation of the flange and the mean wrench."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +17,7 @@ print(f"torque bias     {result.torque_bias_Nm.round(3)} N·m")
 for finding in result.findings:
     print(f"{finding.severity} {finding.code}: {finding.words}")
 
-with TemporaryDirectory() as folder:  # yours: a folder that stays
+with TemporaryDirectory() as folder:  # in your program: a permanent folder
     path = Path(folder, "calibration.json")
     result.save(path)
     print("read again:", ftdrive.read_calibration(path).id == result.id)

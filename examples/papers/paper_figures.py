@@ -29,7 +29,7 @@ Drawing = tuple[Figure, list[Row]]
 
 DOWN = np.array([0.0, 0.0, -1.0])
 SENSOR_NOISE = np.repeat([0.2, 0.01], 3)
-"""Amplitude, N and N m. With it and `ORIENTATION_NOISE_RAD` the errors are as large as those of Table III."""
+"""Noise amplitude, N and N m. With it and `ORIENTATION_NOISE_RAD`, the errors are as large as those of Table III."""
 ORIENTATION_NOISE_RAD = 0.04
 HARDWARE = ftcalib.Parameters(  # Yu, Table II, with the weight and the centre of Table III
     R_flange_sensor=Rotation.from_matrix(
@@ -526,7 +526,7 @@ FIGURES: Mapping[str, Callable[[np.random.Generator], Drawing]] = {
 
 
 def main() -> None:
-    """Draw and print what the command line names."""
+    """Draw and print the figures that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument(
         "figures", nargs="*", metavar="FIGURE", help=f"one or more of {', '.join(FIGURES)}; default: all"

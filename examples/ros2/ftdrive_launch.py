@@ -10,7 +10,7 @@ HERE = Path(__file__).parent
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the node, started again if it ends by itself."""
+    """Return the node, which is restarted if it ends by itself."""
     defaults = {
         "calibration": "runs/gripper",
         "config": "ftdrive.toml",

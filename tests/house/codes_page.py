@@ -19,11 +19,11 @@ The worst severity gives the verdict:
 |---|---|
 | `reject` | rejected |
 | `limit` | usable at best |
-| `note` | not worse for it |
+| `note` | not affected |
 
 Findings are ordered as in this table, notes last: a cause stands before its consequences, so fix the first one first.
 [Methods](../explanation/methods.md#mistakes-in-the-data) explains how they are found.
-Values stand as their names, which end with their units. A value that is not known is null.
+Values are shown by their names, which end with their units. An unknown value is null.
 
 | code | severity | found | fix |
 |---|---|---|---|"""
