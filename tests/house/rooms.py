@@ -157,9 +157,9 @@ HEAD = """# Four walks through the code
 
 Each list is the trace of one real command: every module of which a function ran, below the module that called it first,
 with the first function called. Modules at the left edge were entered by the command line or by a thread.
-`uv run python -m tests.house.rooms` traces them again; `tests/house/test_counts.py` has the ceilings of their numbers.
+`uv run python -m tests.house.rooms` traces them again; `tests/house/test_counts.py` limits their numbers of modules.
 
-[Architecture](../explanation/architecture.md) has the packages and what each may import.
+[Architecture](../explanation/architecture.md) lists the packages and what each may import.
 """
 
 if __name__ == "__main__":
