@@ -113,25 +113,6 @@ def test_a_reference_of_zero_has_no_relative_errors() -> None:
     assert test["mass_error"] is test["centre_error"] is None
 
 
-def test_more_data_are_better_and_the_inside_of_the_data_is_best() -> None:
-    """The rules that the text draws from the table: cases 3 and 4, 5 and 6, 6 and 11."""
-    errors = np.zeros(len(CASES))
-    for seed in range(6):
-        noise = np.random.default_rng(seed).normal(0.0, 0.2, (len(POSES), 6)) * [1, 1, 1, 0.025, 0.025, 0.025]
-        dataset = CalibrationDataset.of(POSES, predict(TRUTH, POSES) + noise)
-        clean = predict(TRUTH, POSES)
-        found = table_iii(dataset, NUMBERS.tolist(), TRUTH)
-        errors += [one.parameters is not None and _far(one.parameters, clean, test) for _, _, test, one in found]
-    assert errors[3] < errors[2]
-    assert errors[5] < errors[4]
-    assert errors[10] < errors[5]
-
-
-def _far(parameters: Parameters, clean: np.ndarray, test: str) -> float:
-    rows = np.isin(NUMBERS, set_numbers(test))
-    return float(np.linalg.norm((predict(parameters, POSES[rows]) - clean[rows])[:, :3], axis=1).max())
-
-
 def test_missing_poses_are_counted_in_every_set() -> None:
     with pytest.raises(NotObservable, match=r"\(1 of A\)"):
         table_iii(measured(0.0), [0, *NUMBERS[1:].tolist()], TRUTH)

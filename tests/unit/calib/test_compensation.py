@@ -71,21 +71,6 @@ def test_every_row_is_written_to_the_buffer(n: int, dtype: type[np.float64 | np.
     np.testing.assert_allclose(out, expected, atol=1e-13 if dtype is np.float64 else 1e-5)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32, "float64", np.dtype("float64"), np.dtype("float32")])
-def test_results_have_the_type_asked_for_however_it_is_named(dtype: DTypeLike) -> None:
-    rng = np.random.default_rng(0)
-    parameters = random_parameters(rng)
-    wrench, R_base_flange = samples(3, rng)
-    expected = wrench - predict(parameters, R_base_flange)
-    compensator = Compensator(parameters, dtype)
-    many = compensator.batch(wrench, R_base_flange)
-    assert many.dtype == dtype
-    np.testing.assert_allclose(many, expected, atol=1e-5)
-    one = compensator.sample(wrench[0], R_base_flange[0])
-    assert one.dtype == dtype
-    np.testing.assert_allclose(one, expected[0], atol=1e-5)
-
-
 def test_the_wrench_can_be_overwritten_with_the_result() -> None:
     rng = np.random.default_rng(1)
     parameters = random_parameters(rng)

@@ -90,11 +90,3 @@ def test_another_origin_of_the_sensor_moves_the_centre_of_mass_and_the_torques(s
         p.torque_bias_Nm - np.cross(d, p.force_bias_N),
     )
     assert_same(other, moved)
-
-
-@settings(max_examples=4)
-@given(seeds)
-def test_simultaneous_poses_have_no_order(seed: int) -> None:
-    R, wrench, cov = poses(seed)
-    mixed = np.random.default_rng(seed + 3).permutation(len(R))
-    assert_same(answer(R[mixed], wrench[mixed], cov[mixed]), answer(R, wrench, cov).parameters)

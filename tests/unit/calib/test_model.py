@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ftcalib import PARAMETER_NAMES, Parameters
-from ftcalib.model import Array, angle_between, gravity_wrench, jacobian, nearest_rotation, predict, rotation_of, skew
+from ftcalib.model import Array, angle_between, gravity_wrench, jacobian, predict, rotation_of
 
 SENSOR_Z_DOWN = Rotation.from_euler("x", 180, degrees=True).as_matrix()
 
@@ -71,18 +71,6 @@ def test_difference_undoes_moved(seed: int) -> None:
     parameters, step = random_parameters(rng), rng.normal(size=15)
     step[:3] *= min(1.0, 3.0 / float(np.linalg.norm(step[:3])))  # half a turn and more has a shorter way round
     np.testing.assert_allclose(parameters.difference(parameters.moved(step)), step, atol=1e-13)
-
-
-def test_skew_is_the_cross_product_and_nearest_rotation_is_a_rotation() -> None:
-    rng = np.random.default_rng(0)
-    a, b = rng.normal(size=(2, 7, 3))
-    np.testing.assert_allclose((skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=1e-15)
-    M = rng.normal(size=(50, 3, 3))
-    R = nearest_rotation(M)
-    np.testing.assert_allclose(np.linalg.det(R), 1)
-    for i in range(50):  # no other rotation is closer
-        others = Rotation.random(200, rng=rng).as_matrix()
-        assert np.linalg.norm(M[i] - R[i]) <= np.linalg.norm(M[i] - others, axis=(1, 2)).min()
 
 
 def test_parameters_are_frozen_copies_of_the_right_shape() -> None:

@@ -65,19 +65,6 @@ def test_every_promised_key_is_in_the_file_with_its_value() -> None:
     np.testing.assert_array_equal(document["residuals"], DATA.wrench - predict(RESULT.parameters, DATA.R_base_flange))
 
 
-def test_sigmas_of_mass_and_tilt_agree_with_sampling() -> None:
-    rng = np.random.default_rng(2)
-    steps = rng.multivariate_normal(np.zeros(15), RESULT.tool_covariance, 1000)
-    samples = [weight_and_tilt(RESULT.parameters.moved(step).gravity_force_base_N) for step in steps]
-    weight_N, *tilt = np.std(samples, axis=0)
-    for name, spread in {
-        "mass_kg": weight_N / RESULT.g_m_s2,
-        "weight_N": weight_N,
-        **dict(zip(("tilt_alpha_rad", "tilt_beta_rad"), tilt, strict=True)),
-    }.items():
-        assert spread == pytest.approx(RESULT.sigma[name], rel=0.06), name
-
-
 @pytest.mark.parametrize("F_b", [[0, 20.0, 0], [0, -20.0, 0], [0, 0, 0]])
 def test_an_undefined_tilt_has_a_finite_uncertainty(F_b: list[float]) -> None:
     parameters = replace(RESULT.parameters, gravity_force_base_N=np.array(F_b))

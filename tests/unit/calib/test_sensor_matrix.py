@@ -53,23 +53,6 @@ def test_decoding_by_known_errors_is_exact_to_first_order() -> None:
     np.testing.assert_allclose(com_m, p.p_sensor_com_m, atol=2e-4)
 
 
-def test_a_tool_shows_the_errors_of_forces_at_its_centre_of_mass() -> None:
-    rng, p = np.random.default_rng(1), parameters()
-    found, seen = calibration_of(errors(rng), p)
-    sure = Response(seen.coefficients, 1e-16 * np.eye(15 + SIZE))
-    contact = SensorMatrix.usual(lever_m=LEVER_M).contact_response(found, sure)
-    force = 50 * rng.normal(size=(30, 3))
-
-    def sigma(place: Array) -> float:
-        """One sigma of the force across its direction: along it the scale remains unknown."""
-        wrench = np.concatenate([force, np.cross(place, force)], axis=1)
-        C = contact.covariance(wrench)[:, :3, :3]
-        along = force / np.linalg.norm(force, axis=1)[:, None]
-        return float(np.mean(np.trace(C, axis1=1, axis2=2) - np.einsum("ni,nij,nj->n", along, C, along)))
-
-    assert sigma(found.p_sensor_com_m) < 0.05 * sigma(found.p_sensor_com_m + np.array([0, 0, 0.15]))
-
-
 def test_sigma_follows_the_prior_and_the_contact() -> None:
     contact = SensorMatrix.usual(0.02).contact_response(parameters())
     along_x = contact.covariance(np.array([100.0, 0, 0, 0, 0, 0]))
@@ -132,14 +115,6 @@ def test_a_weighed_tool_shows_the_gain_common_to_all_axes() -> None:
     along = force / np.linalg.norm(force)
     sigma = [float(np.sqrt(along @ one.covariance(true)[:3, :3] @ along)) for one in (plain, weighed)]
     assert sigma[1] < 0.7 * sigma[0]
-
-
-@pytest.mark.parametrize("size", [0.3, 2.5])
-def test_the_size_of_the_errors_is_learnt_from_the_tool(size: float) -> None:
-    prior, contact = SensorMatrix.usual(0.02), np.array([0, 60.0, 0, 3, 0, 0])
-    E = errors(np.random.default_rng(4), size * 0.02)
-    learnt = prior.contact_response(*calibration_of(E, parameters())).covariance(contact)[1, 1]
-    assert (learnt > prior.contact_response(parameters()).covariance(contact)[1, 1]) == (size > 1)
 
 
 def solved() -> CalibrationResult:

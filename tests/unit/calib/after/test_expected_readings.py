@@ -89,15 +89,6 @@ def test_hysteresis_is_a_share_of_each_change_of_load() -> None:
     assert expected.freedom == pytest.approx(6 * (24 / 12) ** 2, rel=1e-2)  # 12 of 24 readings are determined by it
 
 
-def test_without_components_the_residuals_show_a_factor_of_the_noise() -> None:
-    calibration = replace(found_with(), chi2=3.0 * calibrated().dof)
-    _, _, expected = added(calibration)
-    assert (expected.factor, expected.freedom) == (3.0, calibration.dof)
-    assert expected_as_found(replace(calibration, chi2=1e-3), NEW, COV).factor == 0.1
-    gain = expected_as_found(found_with(gain=0.01), NEW, COV)
-    assert (gain.factor, gain.freedom) == (1.0, np.inf)
-
-
 def test_p_value_and_deviance_follow_from_the_freedom_of_the_noise() -> None:
     one = Expected(Update(TRUTH, np.zeros((15, 15)), 0.0, 0), block_diag(*COV), 10.0, 2.0)
     assert one.p_value(60.0, 24) == pytest.approx(f.sf(30 / 24, 24, 10))

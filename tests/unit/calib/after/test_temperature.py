@@ -124,16 +124,6 @@ def test_only_what_predicts_is_applied_and_never_beyond_the_runs() -> None:
     assert found.change(30.0, 90.0)[0] == pytest.approx(found.change(30.0, found.warmest_C)[0])
 
 
-def test_a_changed_bias_widens_its_sigma_alone() -> None:
-    before, step = calibrated(), np.arange(1.0, 7.0)
-    after = with_bias_change(before, step, (0.1 * step) ** 2)
-    wrench = np.concatenate([after.parameters.force_bias_N, after.parameters.torque_bias_Nm])
-    assert wrench == pytest.approx(np.concatenate([before.force_bias_N, before.torque_bias_Nm]) + step)
-    wider = np.diag(after.covariance - before.covariance)
-    assert wider[BIASES] == pytest.approx((0.1 * step) ** 2)
-    assert np.count_nonzero(wider) == 6
-
-
 def test_a_measured_bias_has_its_own_sigma_also_beside_a_gain() -> None:
     joint = np.eye(26) + 0.1
     before = replace(calibrated(), covariance=joint[:15, :15], response=Response(np.full(11, 0.01), joint))

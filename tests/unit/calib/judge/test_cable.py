@@ -44,17 +44,6 @@ def test_sigma_of_the_centre_of_mass_allows_for_a_cable(measured: bool) -> None:
     assert 0.01 < finding.values["torque_Nm"] < 0.03
 
 
-def test_the_estimates_compensation_and_biases_do_not_use_it() -> None:
-    result = calibrated(0.02 * np.eye(3), 2)
-    shift = result.cable_shift
-    assert shift is not None
-    assert not shift[BIASES].any()
-    without = replace(result, cable_shift=None).tool_covariance
-    np.testing.assert_allclose(result.tool_covariance - without, np.outer(shift, shift), atol=1e-15)
-    rest = result.residuals[:, 3:]
-    assert np.sqrt(np.mean(np.sum(rest**2, axis=1))) > 3e-3
-
-
 @pytest.mark.parametrize("measured", [True, False])
 def test_white_noise_shows_no_cable(measured: bool) -> None:
     for seed in range(2):
@@ -108,10 +97,3 @@ def test_a_cable_is_found_and_moves_the_estimates_as_least_squares_with_nine_mor
                 np.sqrt(np.mean(np.sum(torque_Nm**2, axis=1))), rel=0.01
             )
     assert outcomes == {True, False}
-
-
-@pytest.mark.parametrize(("n", "looked_for"), [(7, False), (8, True)])
-def test_a_cable_is_looked_for_where_poses_can_show_it(n: int, looked_for: bool) -> None:
-    found, X = quiet(n)
-    pulled = replace(found, wrench=found.wrench + X @ (0.5 * np.eye(3).ravel()))
-    assert (cable_of(pulled) is not None) == looked_for

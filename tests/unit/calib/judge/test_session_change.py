@@ -5,17 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
 from ftcalib.judge.faults import rough_fit
-from ftcalib.judge.session_change import KINDS, SessionChange, _groups, _likeliest_change, bias_steps
+from ftcalib.judge.session_change import KINDS, SessionChange, _likeliest_change
 from ftcalib.judge.verdict import Case, statistics
 from ftcalib.likelihood.fit import fit
 from ftcalib.likelihood.session import LEVER_M
 from ftcalib.model import Parameters, SPECIAL_R_flange_base, jacobian, predict
-from ftcalib.sensor_matrix import SIZE, response_columns
 from ftcalib.solver import _find_change
 from tests.structured_cell import CELLS, Cell, flange, tour
 
@@ -86,12 +84,6 @@ def test_poses_of_two_loads_are_refused(after: Parameters, code: str, position: 
         assert first.values["change_N"] == pytest.approx(-0.36, abs=0.01)
 
 
-def test_the_load_as_it_is_now_is_kept_where_the_others_were_left_out() -> None:
-    result = session(SHIFTED, 3, seed=1)
-    assert result.verdict == "usable"
-    assert np.abs(sigmas(result, SHIFTED)).max() < 4
-
-
 def test_poses_count_as_they_were_taken_not_as_they_stand() -> None:
     rows = np.random.default_rng(3).permutation(24)
     result = session(LIGHTER, 12, seed=2, rows=rows)
@@ -146,18 +138,6 @@ def test_a_random_walk_is_no_step(seed: int, measured: bool) -> None:
     assert not found & {"bias_stepped", "com_shifted", "load_changed", "sensor_turned", "sensor_changed"}
 
 
-def test_gain_and_cross_talk_of_a_fit_hide_no_part_of_a_change() -> None:
-    rng = np.random.default_rng(0)
-    wrench = np.where(np.arange(24)[:, None] < 14, predict(TOOL, ORIENTATIONS), predict(LIGHTER, ORIENTATIONS))
-    wrench += rng.normal(0, SIGMA, wrench.shape) + response_columns(TOOL, ORIENTATIONS) @ rng.normal(0, 0.01, SIZE)
-    change = _likeliest_change(TOOL, ORIENTATIONS, wrench, SIGMA)
-    assert change is not None
-    assert (change.code, change.starts.tolist()) == ("load_changed", [14])
-    # Beside 15 free parameters the sigma of a step between two halves is about that of a mean of 4 poses.
-    lighter_N = np.linalg.norm(LIGHTER.gravity_force_base_N) - np.linalg.norm(TOOL.gravity_force_base_N)
-    assert change.values["change_N"] == pytest.approx(lighter_N, abs=3 * SIGMA[0] / 2)
-
-
 COUNT = np.arange(24)
 STEP_N = np.array([0.2, 0, 0.1])
 STEPPED = replace(TOOL, force_bias_N=TOOL.force_bias_N + STEP_N, torque_bias_Nm=TOOL.torque_bias_Nm - 0.01)
@@ -194,22 +174,6 @@ def test_a_change_is_as_large_as_it_is_and_can_be_undone(
         assert change.misfit < 1e-3
 
 
-@pytest.mark.parametrize("n", [12, 13])
-def test_changes_are_tried_that_leave_three_poses_on_each_side(n: int) -> None:
-    found = [(pure, [row.tolist() for row in groups]) for pure, groups in _groups(n)]
-    half = n // 2
-
-    def later(first: int) -> list[bool]:
-        return [k >= first for k in range(n)]
-
-    assert found == [
-        (None, [*(later(first) for first in range(3, n - 2)), [k % 2 == 1 for k in range(n)]]),
-        (slice(0, half), [later(first) for first in range(half, n - 2)]),
-        (slice(half, n), [[not one for one in later(first)] for first in range(3, half + 1)]),
-        (slice(0, n, 2), [[k % 2 == 1 for k in range(n)]]),
-    ]
-
-
 def test_the_likelihood_is_that_of_the_dense_covariance_less_what_components_must_bring() -> None:
     rng = np.random.default_rng(7)
     wrench = predict(TOOL, ORIENTATIONS) + rng.normal(0, SIGMA, (24, 6))
@@ -220,19 +184,6 @@ def test_the_likelihood_is_that_of_the_dense_covariance_less_what_components_mus
     J, e = jacobian(found.parameters, ORIENTATIONS).reshape(144, 15), found.residuals.ravel()
     logdet = np.linalg.slogdet(J.T @ W @ J)[1] - np.linalg.slogdet(W)[1]
     assert found.minus_two_log_likelihood == pytest.approx(logdet + e @ W @ e + 2 * (2 + 2), abs=1e-4)
-
-
-def test_a_rejected_pose_costs_the_limit_and_a_logarithm_beyond_it() -> None:
-    wrench = predict(TOOL, ORIENTATIONS) + np.random.default_rng(8).normal(0, SIGMA, (24, 6))
-    wrench[5] += 30 * SIGMA
-    found = fit(ORIENTATIONS, wrench, np.diag(SIGMA**2), drift="none")
-    assert np.flatnonzero(found.weights == 0).tolist() == [5]
-    others = fit(np.delete(ORIENTATIONS, 5, 0), np.delete(wrench, 5, 0), np.diag(SIGMA**2), drift="none")
-    e, S = found.left_out_residuals[5], found.left_out_cov[5]
-    limit, distance = stats.chi2.isf(1e-3, 6), e @ np.linalg.solve(S, e)
-    cost = np.linalg.slogdet(S)[1] + limit + 6 * np.log(distance / limit)
-    assert found.components == others.components == {}
-    assert found.minus_two_log_likelihood - others.minus_two_log_likelihood == pytest.approx(cost, abs=0.01)
 
 
 def zeroed(places: list[int], seed: int, n: int = 24) -> CalibrationResult:
@@ -269,21 +220,6 @@ def test_a_sensor_that_warms_up_is_not_zeroed() -> None:
         cooling = 0.6 * np.exp(-np.arange(24) / 8)[:, None] * np.repeat([1.0, 0.025], 3)
         found = {one.code for one in session(TOOL, 12, seed, added=cooling, measured=False).findings}
         assert "bias_stepped" not in found
-
-
-def test_steps_of_the_bias_are_found_where_they_are() -> None:
-    rng = np.random.default_rng(2)
-    for places in ([3, 7, 13], [2, 20], [12]):
-        R = Rotation.random(24, rng=rng).as_matrix()
-        wrench = predict(TOOL, R) + rng.normal(0, SIGMA, (24, 6))
-        unstepped = wrench.copy()
-        for place in places:
-            wrench[place:] += rng.normal(0, [3, 3, 3, 0.1, 0.1, 0.1])
-        change = bias_steps(R, wrench)
-        assert change is not None
-        assert change.starts.tolist() == places
-        # A bias of a few poses is as uncertain as their fit.
-        assert np.abs(change.corrected - unstepped).max() < 20 * SIGMA[0]
 
 
 def all_disturbances(seed: int, turn_deg: float) -> CalibrationResult:

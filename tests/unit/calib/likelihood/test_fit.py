@@ -10,7 +10,7 @@ from ftcalib import Parameters
 from ftcalib.data.dataset import pooled_covariance
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.descent import Descent, Statistics, coefficients, coefficients_derivative, features, wrench_gram
-from ftcalib.likelihood.fit import Fit, _second_basin_chi2, fit
+from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.session import Drift
 from ftcalib.likelihood.session_noise import CHUNK, Noise, inverse_blocks, summed_products
 from ftcalib.likelihood.variance_components import squared_length
@@ -112,32 +112,6 @@ def test_statistics_give_the_normal_equations_of_the_data() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "runs"),
-    [
-        ("haar12", 20),
-        pytest.param("haar12", 80, marks=pytest.mark.slow),
-        pytest.param("haar6", 60, marks=pytest.mark.slow),
-        pytest.param("cone40_24", 40, marks=pytest.mark.slow),
-    ],
-)
-def test_errors_are_at_the_cramer_rao_bound(kind: str, runs: int) -> None:
-    error, least, distance, p_values = np.zeros(5), np.zeros(5), [], []
-    for seed in range(runs):
-        rng = np.random.default_rng(seed)
-        R = cone(rng, 24, 40) if kind.startswith("cone") else haar(rng, int(kind[4:]))
-        p = truth(rng)
-        best = fit(R, predict(p, R) + noise(rng, len(R)), WHITE, gain_sigma=0.0)
-        error += squared(best, p)
-        least += bound(p, R, np.linalg.inv(WHITE))
-        e = best.parameters.difference(p)
-        distance.append(e @ np.linalg.solve(best.covariance, e))
-        p_values.append(stats.chi2.sf(best.measured_chi2, best.dof))
-    np.testing.assert_allclose(error / least, 1, atol=0.4)
-    assert np.mean(np.array(distance) < stats.chi2.isf(0.05, 15)) > 0.86
-    assert stats.kstest(p_values, "uniform").pvalue > 1e-3
-
-
-@pytest.mark.parametrize(
     ("n", "degrees", "weight_in_sigma"), [(6, 180, 10), (12, 40, 30), pytest.param(24, 20, 30, marks=pytest.mark.slow)]
 )
 def test_no_start_reaches_a_lower_minimum(n: int, degrees: float, weight_in_sigma: float) -> None:
@@ -191,19 +165,6 @@ def test_bumped_poses_are_rejected_and_no_others(n: int, bumped: int, measured: 
     distances = squared_length(best.left_out_residuals, best.left_out_cov)
     assert (distances[:bumped] > 22).all()
     assert (squared(best, p) / bound(p, R[bumped:], np.linalg.inv(WHITE)) < 4).all()
-
-
-@pytest.mark.parametrize(("seed", "bumped"), [(3, 6), (1002, 2)])
-def test_a_component_that_only_bumped_poses_need_goes_with_them(seed: int, bumped: int) -> None:
-    rng = np.random.default_rng(seed)
-    p, R = truth(rng), haar(rng, 24)
-    push = rng.normal(size=(bumped, 3))
-    push *= (WEIGHT_N * rng.uniform(0.2, 1, bumped) / np.linalg.norm(push, axis=1))[:, None]
-    wrench = predict(p, R) + noise(rng, 24)
-    wrench[:bumped] += np.concatenate([push, np.cross(0.1 * rng.normal(size=(bumped, 3)), push)], axis=1)
-    best = fit(R, wrench, WHITE)
-    assert np.flatnonzero(best.weights == 0).tolist() == list(range(bumped))
-    assert (best.components, best.drift) == ({}, None)
 
 
 def test_seven_poses_are_never_split_into_right_and_wrong() -> None:
@@ -274,21 +235,6 @@ def test_a_linear_drift_is_named_and_measured() -> None:
     assert best.dof == 6 * 24 - 15 - 6
 
 
-def test_times_order_the_poses() -> None:
-    rng = np.random.default_rng(5)
-    _, R, wrench, _ = drifting(rng, 60, "walk")
-    cov, order = np.diag((SIGMA / 10) ** 2), rng.permutation(60)
-    best = fit(R, wrench, cov)
-    shuffled = fit(R[order], wrench[order], cov, t_s=3 * order.astype(np.float64))
-    assert np.abs(best.parameters.difference(shuffled.parameters)).max() < 1e-6
-    np.testing.assert_allclose(shuffled.left_out_residuals, best.left_out_residuals[order], atol=1e-5)
-    assert best.drift is not None
-    assert shuffled.drift is not None
-    assert best.drift.course is not None
-    assert shuffled.drift.course is not None
-    np.testing.assert_allclose(shuffled.drift.course, best.drift.course[order], atol=1e-5)
-
-
 @pytest.mark.parametrize("drift", DRIFTS[1:])
 def test_left_out_poses_are_predicted_as_by_a_new_fit(drift: Drift) -> None:
     rng = np.random.default_rng(6)
@@ -331,23 +277,6 @@ def test_a_drift_is_the_best_linear_prediction_and_its_sigma_that_of_its_error()
     np.testing.assert_allclose(best.drift.sigma, sigma, rtol=1e-6)
 
 
-def test_a_second_minimum_is_worse_by_chi2_or_by_the_likelihood_of_its_own_noise() -> None:
-    rng = np.random.default_rng(11)
-    p, R = truth(rng), haar(rng, 8)
-    best = fit(R, predict(p, R) + noise(rng, 8), WHITE, drift="none")
-    minima = best.chi2, best.chi2 + 9, 1e9
-    assert _second_basin_chi2(minima[:1], {}, best.dof) is None
-    assert _second_basin_chi2(minima, {"gain": 0.01}, best.dof) == pytest.approx(9)
-    estimated = _second_basin_chi2(minima, {"white_force_N": 0.1}, best.dof)
-
-    def loglik(chi2: float) -> float:
-        """Of residuals with the standard deviation that fits them best."""
-        return float(-best.dof * np.log(np.sqrt(chi2 / best.dof)) - best.dof / 2)
-
-    odds = 2 * (loglik(minima[0]) - loglik(minima[1]))
-    assert estimated == pytest.approx(odds)
-
-
 # What is known before
 
 
@@ -371,37 +300,6 @@ def random_known(name: str, p: Parameters, rng: np.random.Generator) -> Known:
         return Known(R_flange_sensor=turn @ p.R_flange_sensor, yaw_only=True)
     lean = Rotation.from_rotvec(small * np.append(rng.normal(size=2), 0)).as_matrix()
     return Known(R_flange_sensor=turn @ lean @ p.R_flange_sensor, yaw_only=True, R_tolerance_rad=small)
-
-
-@pytest.mark.parametrize(
-    ("name", "unknowns"),
-    [
-        ("rotation", 12),
-        ("rotation about", 15),
-        ("direction", 13),
-        ("direction about", 15),
-        ("mass", 14),
-        ("mass about", 15),
-        ("yaw", 13),
-        ("yaw about", 15),
-    ],
-)
-def test_knowledge_is_used_for_what_it_is_worth(name: str, unknowns: int) -> None:
-    runs = 2
-    distance, chi2 = [], []
-    for seed in range(runs):
-        rng = np.random.default_rng(seed)
-        p, R = truth(rng), haar(rng, 8)
-        wrench = predict(p, R) + noise(rng, 8)
-        best = fit(R, wrench, WHITE, known=random_known(name, p, rng), drift="none", gain_sigma=0.0)
-        assert best.free.shape == (15, unknowns)
-        e = best.free.T @ best.parameters.difference(p)
-        distance.append(e @ np.linalg.solve(best.free.T @ best.covariance @ best.free, e))
-        chi2.append(best.chi2)
-    free = fit(R, wrench, WHITE, drift="none", gain_sigma=0.0)
-    assert np.linalg.eigvalsh(free.covariance - best.covariance).min() > -0.2 * np.abs(free.covariance).max()
-    assert np.mean(distance) == pytest.approx(unknowns, abs=2.5 * np.sqrt(2 * unknowns / runs))
-    assert np.mean(chi2) == pytest.approx(best.dof, abs=2.5 * np.sqrt(2 * best.dof / runs))
 
 
 @pytest.mark.parametrize(
@@ -480,16 +378,6 @@ def test_covariances_from_few_samples_do_no_harm(samples: int, spread: float) ->
         assert np.mean(direct / least) > 1.3
 
 
-def test_covariances_of_unknown_origin_are_taken_as_they_are() -> None:
-    rng = np.random.default_rng(9)
-    A = rng.normal(size=(5, 6, 8))
-    S = A @ np.swapaxes(A, 1, 2)
-    np.testing.assert_array_equal(pooled_covariance(S, np.zeros(5, np.int64)), S)
-    mixed = pooled_covariance(S, np.array([0, 10, 10, 10**9, 0]))
-    np.testing.assert_array_equal(mixed[[0, 4]], S[[0, 4]])
-    np.testing.assert_allclose(mixed[3], S[3], rtol=1e-4)
-
-
 def test_many_poses_are_predicted_in_parts_as_they_would_be_at_once() -> None:
     rng = np.random.default_rng(8)
     n = CHUNK + 50
@@ -517,30 +405,6 @@ def test_the_blocks_of_the_inverse_are_those_of_the_dense_one(n: int) -> None:
     own, beside = inverse_blocks(diagonal, above)
     np.testing.assert_allclose(own, inverse[range(n), :, range(n)], atol=1e-12)
     np.testing.assert_allclose(beside, inverse[range(n - 1), :, range(1, n)], atol=1e-12)
-
-
-@pytest.mark.parametrize("bumped", [pytest.param(0, marks=pytest.mark.slow), 12])
-def test_among_many_poses_larger_noise_rejects_none_and_bumped_poses_are_rejected(bumped: int) -> None:
-    rng = np.random.default_rng(4)
-    p, R = truth(rng), haar(rng, 510)
-    wrench = predict(p, R) + noise(rng, 510, 1.5 * SIGMA)
-    wrench[:bumped] += 12 * SIGMA * rng.choice([-1, 1], size=(bumped, 6))
-    found = fit(R, wrench, np.broadcast_to(WHITE, (510, 6, 6)))
-    rejected = np.flatnonzero(found.weights == 0)
-    assert rejected[:bumped].tolist() == list(range(bumped))
-    assert len(rejected) <= bumped + bool(bumped)  # among so many, one that is not bumped
-
-
-def test_a_bias_is_uncertain_where_a_drift_leaves_no_noise() -> None:
-    z = []
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        p, R = truth(rng), haar(rng, 12)
-        warming = (1 - np.exp(-np.arange(12) / 4))[:, None] * np.repeat([2.0, 0.05], 3)
-        found = fit(R, predict(p, R) + warming - warming[-1] + noise(rng, 12))
-        z.append(p.difference(found.parameters)[6:9] / np.sqrt(np.diag(found.covariance)[6:9]))
-        assert found.components["white_force_N"] > 0.1 * SIGMA[0]
-    assert np.sqrt(np.mean(np.square(z))) < 1.5
 
 
 def test_residuals_below_what_a_sensor_resolves_are_the_noise() -> None:

@@ -1,22 +1,14 @@
 """Gain and cross-talk of the sensor: found where they are, applied, kept in the file."""
 
-import json
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters, Setup, solve
 from ftcalib.judge.verdict import _response_findings
-from ftcalib.known import RANGE_LEVER_M, Constraints, Known
-from ftcalib.likelihood.explanation import with_walks_instead
+from ftcalib.known import RANGE_LEVER_M
 from ftcalib.likelihood.fit import Fit, fit
-from ftcalib.likelihood.session import SessionData
-from ftcalib.likelihood.variance_components import FORCE, RESPONSE, channel_component, maximise
 from ftcalib.model import Array, gravity_wrench, predict
-from ftcalib.result import require_positive_definite
 from ftcalib.sensor_matrix import CROSS_TALK_M, GAIN, Response, response_columns
 
 SIGMA = np.repeat([0.05, 0.00125], 3)
@@ -83,57 +75,12 @@ def test_a_sensor_of_wrong_gain_is_predicted_as_well_as_by_an_oracle(measured: b
 
 
 @pytest.mark.slow
-def test_the_error_of_the_prediction_is_as_stated() -> None:
-    distances = []
-    for seed in range(9):
-        rng = np.random.default_rng(seed)
-        p, R, wrench, M, L = session(rng, 12, 0.02, 0.02)
-        result = solve(CalibrationDataset(R, wrench, np.tile(WHITE, (12, 1, 1)), np.zeros(12, int), np.arange(12.0)))
-        elsewhere = Rotation.random(1, rng=rng).as_matrix()
-        e = result.compensate(read(p, elsewhere, M, L), elsewhere)[0]
-        distances.append(e @ np.linalg.solve(result.wrench_covariance(elsewhere)[0], e))
-    assert 4 < np.mean(distances) < 10
-
-
-@pytest.mark.slow
 def test_nothing_is_found_in_a_sensor_without_error() -> None:
     found = 0
     for seed in range(40):
         _, R, wrench, _, _ = session(np.random.default_rng(seed), 24, 0.0, 0.0)
         found += fit(R, wrench, WHITE).response is not None
     assert found <= 2
-
-
-def test_white_noise_hides_no_walk_and_gain() -> None:
-    rng = np.random.default_rng(1)
-    p, R, wrench, _, _ = session(rng, 24, 0.01, 0.01)
-    wrench += np.cumsum(rng.normal(size=(24, 6)), axis=0) * 0.07 * np.repeat([1, 0.025], 3)
-    data = SessionData(R, wrench, WHITE, None, "auto", Constraints(Known(), 9.8))
-    problem = data.linearise(p, data.everything)
-    hidden = maximise(problem, [channel_component("white", FORCE), RESPONSE[1]], np.array([0.02, 1e-4]))
-    found = {c.name for c in with_walks_instead(problem, hidden, data.candidates(), 0).components}
-    assert {"gain", "walk_force_N"} <= found
-    assert "white_force_N" not in found
-
-
-@pytest.mark.parametrize("seed", [5, 11])
-def test_the_joint_covariance_is_positive_definite_where_the_noise_is_unknown(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    _, R, wrench, _, _ = session(rng, 24, 0.02, 0.01)
-    best = fit(R, wrench + np.cumsum(2 * SIGMA * rng.normal(size=(24, 6)), axis=0), None)
-    assert best.response is not None
-    require_positive_definite(best.response.covariance)
-
-
-def test_a_far_centre_of_mass_is_no_reason_against_gain_and_cross_talk() -> None:
-    rng = np.random.default_rng(3)
-    p, R = truth(rng), np.asarray(Rotation.random(24, rng=rng).as_matrix())
-    p = replace(p, p_sensor_com_m=np.array([0.0, 0.0, 0.2]))
-    M, L = 0.03 * rng.normal(size=(3, 3)), 0.01 * RANGE_LEVER_M * rng.normal(size=(3, 3))
-    best = fit(R, read(p, R, M, L) + SIGMA * rng.normal(size=(24, 6)), WHITE)
-    assert {"gain", "cross_talk"} <= best.components.keys()
-    elsewhere = Rotation.random(50, rng=rng).as_matrix()
-    assert np.sqrt(np.mean((predicted(best, elsewhere) - read(p, elsewhere, M, L)) ** 2)) < SIGMA[0]
 
 
 def test_few_poses_do_not_show_it_and_it_counts_as_that_of_usual_sensors() -> None:
@@ -165,18 +112,6 @@ def test_compensation_applies_it_unless_asked_not_to() -> None:
     plain = result.compensate(wrench, R, response=False)
     np.testing.assert_allclose(plain, wrench - predict(result.parameters, R), atol=1e-12)
     assert np.sqrt(np.mean(plain**2)) > 2 * np.sqrt(np.mean(result.residuals**2))
-
-
-def test_it_is_kept_in_the_file(tmp_path: Path) -> None:
-    result, R, wrench = solved()
-    result.save(tmp_path / "a.json")
-    again = CalibrationResult.load(tmp_path / "a.json")
-    assert result.response is not None
-    assert again.response is not None
-    np.testing.assert_array_equal(again.response.coefficients, result.response.coefficients)
-    np.testing.assert_array_equal(again.compensate(wrench, R), result.compensate(wrench, R))
-    document = json.loads((tmp_path / "a.json").read_text())
-    np.testing.assert_allclose(document["response"]["force_gain"], result.response.force_gain)
 
 
 @pytest.mark.slow
@@ -215,26 +150,6 @@ def test_a_sensor_and_an_arm_that_are_declared_exact_hide_nothing_but_the_least_
     assert 0.014 < usual.sigma["mass_kg"] / usual.mass_kg < 0.018
 
 
-def test_a_known_mounting_hides_no_gain() -> None:
-    p, R, wrench, _, _ = session(np.random.default_rng(0), 24, 0.02, 0.02)
-    cov = np.tile(WHITE, (24, 1, 1))
-    known = Known(R_flange_sensor=p.R_flange_sensor)
-    result = solve(CalibrationDataset(R, wrench, cov, np.zeros(24, int), np.arange(24.0)), known=known)
-    assert result.response is not None
-    np.testing.assert_array_equal(result.sigma["R_flange_sensor"], 0)
-    assert np.min(result.sigma["p_sensor_com_m"]) > 1.5 * np.sqrt(np.diag(result.covariance)[9:12].max())
-
-
-@pytest.mark.parametrize("seed", [53, 112])
-def test_forces_are_not_called_noisy_where_the_torques_alone_determine_the_mounting(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    p = replace(truth(rng), p_sensor_com_m=np.array([0.03, 0.03, 0.15]))
-    R = Rotation.from_euler("xyz", 60 * rng.uniform(-1, 1, (12, 3)), degrees=True).as_matrix()
-    M, L = 0.03 * rng.normal(size=(3, 3)), 0.01 * RANGE_LEVER_M * rng.normal(size=(3, 3))
-    best = fit(R, read(p, R, M, L) + 0.2 * SIGMA * rng.normal(size=(12, 6)), None)
-    assert best.components["white_force_N"] < SIGMA[0]
-
-
 def test_it_is_found_along_the_axes_that_have_it() -> None:
     coefficients = np.zeros(11)
     coefficients[1], coefficients[2] = -0.03, 0.01  # low along x and y, high along z; x mixed with y
@@ -253,30 +168,6 @@ def test_it_is_found_along_the_axes_that_have_it() -> None:
 def test_a_damaged_response_is_refused() -> None:
     with pytest.raises(ValueError, match="coefficients"):
         Response(np.zeros(10), np.eye(26))
-
-
-def coefficients_of(M: Array, L: Array) -> Array:
-    """Coefficients (11,) of the parts of two matrices that show: symmetric, the gain without trace."""
-    gain, cross_talk = (M + M.T) / 2 - np.trace(M) / 3 * np.eye(3), (L + L.T) / 2
-    return np.concatenate(
-        [
-            np.linalg.lstsq(basis.reshape(-1, 9).T, part.ravel())[0]
-            for basis, part in ((GAIN, gain), (CROSS_TALK_M, cross_talk))
-        ]
-    )
-
-
-def test_the_size_of_the_entries_is_that_of_the_whole_matrix() -> None:
-    rng, gains = np.random.default_rng(0), []
-    for M, L in rng.normal(size=(1500, 2, 3, 3)):
-        response = Response(coefficients_of(0.02 * M, 0.003 * L), np.zeros((26, 26)))
-        gains.append(response.gain_sigma**2)
-    assert np.sqrt(np.mean(gains)) == pytest.approx(0.02, rel=0.04)
-    # What is uncertain counts like what was found.
-    found = coefficients_of(0.02 * M, 0.003 * L)
-    unsure = Response(np.zeros(11), np.diag(np.append(np.zeros(15), found**2)))
-    sure = Response(found, np.zeros((26, 26)))
-    assert unsure.gain_sigma == pytest.approx(sure.gain_sigma)
 
 
 def test_sigmas_of_the_entries_are_those_of_their_coefficients() -> None:

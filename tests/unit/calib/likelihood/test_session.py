@@ -6,11 +6,11 @@ from numpy.typing import NDArray
 
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.descent import Minimum
-from ftcalib.likelihood.session import SessionData, inverses, white
+from ftcalib.likelihood.session import SessionData, white
 from ftcalib.likelihood.session_noise import pose_times
-from ftcalib.likelihood.variance_components import FORCE, RESPONSE, TORQUE, Component, channel_component
-from ftcalib.model import Array, jacobian, predict
-from tests.unit.calib.likelihood.sessions import NOTHING_KNOWN, R24, SIGMA_NM, TOOL, session
+from ftcalib.likelihood.variance_components import RESPONSE, Component
+from ftcalib.model import Array, predict
+from tests.unit.calib.likelihood.sessions import NOTHING_KNOWN, R24, TOOL, session
 
 
 def minimum(information: Array) -> Minimum:
@@ -19,12 +19,6 @@ def minimum(information: Array) -> Minimum:
 
 def names(components: list[Component]) -> set[str]:
     return {one.name for one in components}
-
-
-@pytest.mark.parametrize("open_directions", [0, 1, 2, 9])
-def test_a_session_lacks_rank_however_many_directions_are_open(open_directions: int) -> None:
-    information = np.diag(np.repeat([0.0, 3.0], [open_directions, 15 - open_directions]))
-    assert session(R24).lacks_rank(minimum(information)) == bool(open_directions)
 
 
 @pytest.mark.parametrize(("left", "lacks"), [(1.8e-9, True), (2.2e-9, False)])
@@ -75,23 +69,6 @@ def test_data_are_exact_to_what_a_sensor_resolves_and_to_rounding(
     group = slice(0, 3) if channel < 3 else slice(3, 6)
     assert is_exact(resolution, measured=False) == exact
     assert is_exact(1e-10 * np.abs(predict(TOOL, R24)[:, group]).max(), measured=True) == exact
-
-
-def test_one_late_pose_makes_data_inexact() -> None:
-    R, residuals = np.tile(R24, (42, 1, 1)), np.zeros((1008, 6))
-    assert session(R, residuals=residuals).is_exact(TOOL)
-    residuals[1005, 1] = 1.0
-    assert not session(R, residuals=residuals).is_exact(TOOL)
-
-
-def test_variances_start_at_the_mean_square_of_the_used_poses_or_at_their_noise() -> None:
-    residuals = np.tile([0.3, -0.3, 0.3, 0.0, 0.0, 0.0], (24, 1))
-    residuals[0] = 100.0
-    own = session(R24, residuals=residuals)
-    problem = own.linearise(TOOL, np.arange(24) > 0)
-    np.testing.assert_array_equal(own.start(problem, []), np.zeros(0))
-    groups = [*(channel_component("white", on) for on in (FORCE, TORQUE, [4])), channel_component("walk", FORCE)]
-    np.testing.assert_allclose(own.start(problem, groups), [0.09, SIGMA_NM**2, SIGMA_NM**2, 0.09 / 240])
 
 
 @pytest.mark.parametrize(
@@ -151,23 +128,3 @@ def test_from_fifty_poses_on_each_axis_walks_by_itself() -> None:
     found = names(session(np.resize(R24, (50, 3, 3))).candidates())
     assert axes <= found
     assert not WALKS & found
-
-
-def test_what_was_known_before_counts_beside_the_data() -> None:
-    known = Constraints(Known(gravity_direction_base=(0, 0, -1), direction_tolerance_rad=0.01, mass_kg=2.0), 9.8)
-    problem = session(R24, known=known).linearise(TOOL, np.ones(24, bool))
-    A, residual = known.measurements(TOOL)
-    Z = known.free(TOOL)
-    assert Z.shape == (15, 14)
-    np.testing.assert_allclose(problem.J, jacobian(TOOL, R24) @ Z)
-    np.testing.assert_allclose(problem.prior[0], (A @ Z).T @ (A @ Z))
-    np.testing.assert_allclose(problem.prior[1], (A @ Z).T @ residual)
-    np.testing.assert_array_equal(problem.turn, jacobian(TOOL, R24)[..., :3])
-    assert problem.lever == pytest.approx(0.07 / 0.05)
-
-
-def test_noise_is_inverted_pose_by_pose() -> None:
-    A = np.random.default_rng(1).normal(size=(3, 6, 9))
-    cov = A @ np.swapaxes(A, 1, 2)
-    for each in (cov, np.broadcast_to(cov[0], (3, 6, 6))):
-        np.testing.assert_allclose(inverses(each) @ each, np.tile(np.eye(6), (3, 1, 1)), atol=1e-9)

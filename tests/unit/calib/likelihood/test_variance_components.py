@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.integrate import quad
 
 from ftcalib.likelihood.explanation import _prune, rivals, select_explanation, with_slopes_instead
-from ftcalib.likelihood.session_noise import Noise, centre, walk_times
+from ftcalib.likelihood.session_noise import Noise, centre
 from ftcalib.likelihood.variance_components import (
     FORCE,
     HYSTERESIS,
@@ -25,7 +25,6 @@ from ftcalib.likelihood.variance_components import (
     parameter_estimates,
     point,
     score,
-    unit_variances,
 )
 from ftcalib.model import Array
 
@@ -85,22 +84,6 @@ def test_an_unknown_slope_is_one_of_infinite_variance() -> None:
     np.testing.assert_allclose(unknown.solve(X), Noise(D, time, None, np.full(6, 1e5)).solve(X), atol=1e-7)
 
 
-def test_common_noise_is_inverted_once_for_all_poses() -> None:
-    C = covariances(np.random.default_rng(3), 1)[0]
-    common, each = Noise(np.broadcast_to(C, (N, 6, 6))), Noise(np.tile(C, (N, 1, 1)))
-    assert common.W.strides[0] == 0
-    assert common.logdet == pytest.approx(each.logdet)
-    np.testing.assert_allclose(common.blocks, each.blocks)
-
-
-def test_the_walk_multiplies_as_its_covariance() -> None:
-    rng = np.random.default_rng(4)
-    time, X = np.cumsum(rng.uniform(0.1, 3, N)), rng.normal(size=(N, 2))
-    tau = np.cumsum(np.diff(time, prepend=time[0] - 1))
-    K = np.minimum.outer(tau, tau)
-    np.testing.assert_allclose(walk_times(time, X), K @ X)
-
-
 ALL = (WHITE_FORCE, WHITE_TORQUE, ROTATION, WALK_FORCE, channel_component("walk", [5]))
 THETA = np.array([0.3, 0.2, 0.05 / 400, 0.4, 0.1])
 
@@ -147,15 +130,6 @@ def test_slope_and_curvature_are_those_of_the_restricted_likelihood(components: 
     assert np.linalg.eigvalsh(information).min() > 0
 
 
-def test_the_score_of_a_walk_that_the_noise_lacks_is_that_at_zero() -> None:
-    p = problem(np.random.default_rng(5), N, ALL, THETA)
-    without = point(p, ALL[:3], THETA[:3])
-    tiny = np.append(THETA[:3], 1e-7)
-    slope, _ = score(p, without, ALL[:4], tiny)
-    assert ALL[3].kind == "walk"
-    assert slope[3] == pytest.approx(point(p, ALL[:4], tiny).loglik - without.loglik, rel=1e-2)
-
-
 def test_the_restricted_likelihood_is_that_of_error_contrasts() -> None:
     rng = np.random.default_rng(6)
     p = problem(rng, 8, ALL, THETA)
@@ -172,14 +146,6 @@ def test_the_restricted_likelihood_is_that_of_error_contrasts() -> None:
     thetas = np.exp(rng.normal(size=(4, 3))) / [1, 400, 1]
     ours = [point(p, components, theta).loglik for theta in thetas]
     np.testing.assert_allclose(np.diff(ours), np.diff([exact(theta) for theta in thetas]), atol=1e-8)
-
-
-def test_variances_are_recovered() -> None:
-    found = []
-    for seed in range(10):
-        p = problem(np.random.default_rng(seed), 100, ALL, THETA)
-        found.append(maximise(p, ALL, 0.1 / np.array([1, 1, 400, 1, 1])).theta)
-    np.testing.assert_allclose(np.median(found, axis=0), THETA, rtol=0.25)
 
 
 def test_nothing_is_found_where_nothing_is_and_the_walk_where_one_is() -> None:
@@ -209,31 +175,6 @@ def test_what_others_make_needless_is_dropped(walk_first: bool) -> None:
         p = problem(rng, 40, really, np.full(len(really), 0.3))
         at = maximise(p, both, np.full(2, 0.1))
         assert _prune(p, at, needed).components == kept
-
-
-def test_what_is_always_needed_is_not_dropped() -> None:
-    three = (WALK_FORCE, *ALL[:2])
-    p = problem(np.random.default_rng(8), 40, ALL[:2], np.full(2, 0.3))
-    at = maximise(p, three, np.full(3, 0.1))
-    assert _prune(p, at, 1).components == three
-    assert _prune(p, at, 0).components == ALL[:2]
-
-
-def test_a_component_that_brings_little_is_not_dropped_with_one_that_brings_nothing() -> None:
-    small = np.array([0.004 / 400])
-    p = problem(np.random.default_rng(4), 30, (ROTATION,), small)
-    alone = maximise(p, (ROTATION,), small)
-    assert 2 < alone.loglik - point(p, (), np.zeros(0)).loglik < 4  # enough for itself, not for two
-    both = point(p, (ROTATION, ALL[1]), np.append(alone.theta, 1e-12))
-    assert _prune(p, both, 0).components == (ROTATION,)
-
-
-def test_a_turn_of_the_flange_is_distinguished_from_white_noise() -> None:
-    rng = np.random.default_rng(8)
-    turned = problem(rng, 40, (ROTATION,), np.array([0.3 / 400]))
-    assert select_explanation(turned, [], np.zeros(0), list(ALL[:3])).components == (ROTATION,)
-    white = problem(rng, 40, ALL[:1], np.array([0.3]))
-    assert select_explanation(white, [], np.zeros(0), list(ALL[:3])).components == ALL[:1]
 
 
 def test_a_linear_drift_is_preferred_where_it_fits_better() -> None:
@@ -282,50 +223,6 @@ def small(n: int = 12, bumped: int = 2) -> Linearised:
     effects = {"gain": response[..., :5], "cross_talk": response[..., 5:], "hysteresis": hysteresis}
     effects["cable"] = rng.normal(size=(n, 6, 18))
     return Linearised(J, r, prior, turn, D, np.arange(n, dtype=float), kept, False, effects, 0.5)
-
-
-def test_each_component_has_its_columns() -> None:
-    p = small()
-    for c in (GAINS, CROSS_TALK, HYSTERESIS):
-        np.testing.assert_array_equal(p.X[..., p.columns(c)], p.effects[c.kind])
-    for share, own in ((FORCE, slice(9)), (TORQUE, slice(9, 18))):  # three columns for each channel
-        np.testing.assert_array_equal(
-            p.X[..., p.columns(channel_component("cable", share))], p.effects["cable"][..., own]
-        )
-    slopes = centre(p.time)[:, None, None] * np.eye(6)
-    np.testing.assert_array_equal(p.X[..., p.columns(SLOPE_TORQUE)], slopes[..., 3:])
-    np.testing.assert_array_equal(p.X[..., -1], p.r)
-    assert all(p.columns(channel_component(kind, FORCE)) is None for kind in ("white", "walk"))
-    assert p.columns(ROTATION) is None
-
-
-def test_numbers_and_limits_of_the_components() -> None:
-    p = small()
-    sizes = {ROTATION: 20, GAINS: 5, CROSS_TALK: 6, HYSTERESIS: 12}
-    sizes |= {WHITE_FORCE: 30, channel_component("walk", [4]): 10, SLOPE_TORQUE: 3}
-    assert {c: p.size(c) for c in sizes} == sizes
-    limits = {ROTATION: np.radians(3), GAINS: 0.05, CROSS_TALK: 1.5 * 0.05, HYSTERESIS: 0.03}
-    assert {c: p.largest(c) for c in limits} == pytest.approx({c: limit**2 for c, limit in limits.items()})
-    assert p.largest(WALK_FORCE) == np.inf
-    assert (ROTATION.needed, GAINS.needed, CROSS_TALK.needed, HYSTERESIS.needed) == (2, 3, 3, 3)
-    worth = point(p, (WHITE_FORCE, GAINS), np.array([0.1, 0.05**2]))
-    assert worth.worth == pytest.approx(worth.loglik - 5)
-    assert worth.too_large
-    assert not point(p, (WHITE_FORCE, GAINS), np.array([0.1, 0.99 * 0.05**2])).too_large
-
-
-def test_in_units_a_component_is_as_large_as_the_white_noise_of_the_used_poses() -> None:
-    p = small()
-    at = point(p, (), np.zeros(0))
-    expected = {
-        WHITE_FORCE: 0.04,
-        channel_component("white", range(6)): 0.025,
-        SLOPE_TORQUE: 0.01,
-        WALK_TORQUE: 0.01 / 10,
-        ROTATION: min(0.04 / 2**2, 0.01 / 1**2),
-        GAINS: 0.01 / (10 * 0.5**2),
-    }
-    np.testing.assert_allclose(unit_variances(p, at, list(expected)), list(expected.values()))
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5, 1e-3])

@@ -35,17 +35,6 @@ def test_contacts_are_decoded_within_their_sigma(name: str) -> None:
     assert np.linalg.norm(e[:, :3]) < 0.3 * np.linalg.norm((read - wanted)[:, :3])
 
 
-def test_later_loads_narrow_the_same_matrix() -> None:
-    sensor = LoadedSensor(8)
-    tool, side, tip = sensor.runs(PROTOCOLS["hung, side and tip"])
-    first = solve_loads([tool, tip], USUAL).sensor
-    (again,) = sensor.runs([TOOL])
-    second = solve_loads([again, side], first).sensor
-    entries = np.trace(first.covariance[3:, 3:]), np.trace(second.covariance[3:, 3:])
-    assert entries[1] < 0.8 * entries[0]
-    assert np.abs((second.error - sensor.E) / second.sigma).mean() < 1.6
-
-
 def test_the_gradient_of_the_likelihood_is_right() -> None:
     sensor = LoadedSensor(2)
     runs = sensor.runs([replace(TOOL, poses=6), replace(PROTOCOLS["hung, tip"][1], poses=4)])

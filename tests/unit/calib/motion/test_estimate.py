@@ -14,9 +14,7 @@ from ftcalib.motion.estimate import (
     TOUCH_N,
     TOUCH_NM,
     _first_kept,
-    _local_noise,
     _untouched,
-    _without_contact,
     fit_motion,
     rough_delay,
 )
@@ -33,7 +31,7 @@ from ftcalib.motion.model import (
     motion_jacobian,
     wrench_of,
 )
-from ftcalib.motion.problem import DELAY_S, GYRATION_M, HEIGHT_M, KNOT_S, SLOW_S, Problem
+from ftcalib.motion.problem import DELAY_S, GYRATION_M, HEIGHT_M, SLOW_S, Problem
 from ftcalib.motion.samples import Motion, MotionRows
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import Truth, means_of, record, sweep
@@ -130,18 +128,6 @@ def posed() -> Posed:
     return problem, near, effects
 
 
-def test_the_bias_has_a_knot_every_five_seconds(posed: Posed) -> None:
-    problem, _, _ = posed
-    assert len(problem.knots) == 1 + round(44 * 0.4 / KNOT_S)
-    assert (problem.knots[0], problem.knots[-1]) == (0.0, problem.rows.t_s[-1])
-    np.testing.assert_allclose(problem.hats(problem.knots), np.eye(len(problem.knots)), atol=1e-12)
-    np.testing.assert_allclose(problem.hats(problem.rows.t_s).sum(axis=1), 1)
-    for seconds, knots in ((1.0, 2), (12.0, 3), (124.0, 25), (500.0, 25)):
-        n = round(seconds / ROW_S)
-        few = replace(problem.rows[np.zeros(n, np.intp)], t_s=np.arange(n) * np.float64(ROW_S))
-        assert len(Problem(few, None, G, point_mass=False).knots) == knots
-
-
 @pytest.mark.parametrize("off", [(), ("gain",), ("cross_talk", "walk_Nm"), ("walk_N",), tuple(ALL_ON)])
 def test_a_step_is_that_of_generalised_least_squares(posed: Posed, off: tuple[str, ...]) -> None:
     problem, load, effects = posed
@@ -225,13 +211,6 @@ def smoothly_wrong(seed: int) -> tuple[Array, Array, float]:
     return error, ratio, found.components["rotation_rad"]
 
 
-def test_a_smooth_error_of_the_poses_is_part_of_the_next_use() -> None:
-    _, ratio, size_rad = smoothly_wrong(0)
-    assert size_rad > 5e-4
-    assert (ratio > 0.6).all()
-    assert (ratio < 1.6).all()
-
-
 @pytest.mark.slow
 def test_a_smooth_error_of_the_poses_is_part_of_sigma() -> None:
     errors, ratios, _ = zip(*(smoothly_wrong(seed) for seed in range(1, 7)), strict=True)
@@ -249,12 +228,6 @@ def noisy_for_seconds(seed: int) -> tuple[Array, float]:
     bias = [6, 7, 8, 12, 13, 14]
     error = load_of(Truth()).static.difference(found.load.static)[bias]
     return error / np.sqrt(np.diag(found.covariance))[bias], found.components["slow_N"]
-
-
-def test_noise_of_seconds_is_part_of_the_sigma_of_the_bias() -> None:
-    error, size_N = noisy_for_seconds(0)
-    assert 0.05 < size_N < 0.2
-    assert np.abs(error).max() < 3
 
 
 @pytest.mark.slow
@@ -289,32 +262,12 @@ def test_sums_of_many_rows_are_those_of_their_parts(posed: Posed) -> None:
     np.testing.assert_allclose(b[:SIZE], derivative.T @ white, rtol=1e-9, atol=1e-6)
 
 
-def test_rows_beside_a_contact_are_left_out_unless_nothing_fits() -> None:
-    distance = np.full(30, 43.0)  # 1e-7 of chi-square is 43.8
-    distance[10] = 45.0
-    assert np.flatnonzero(~_without_contact(distance)).tolist() == [8, 9, 10, 11, 12]
-    distance[[0, 29]] = 100.0
-    assert np.flatnonzero(~_without_contact(distance)).tolist() == [0, 1, 2, 8, 9, 10, 11, 12, 27, 28, 29]
-    for touched, left_out in ((21, 23), (22, 0)):  # of 30; two more are beside them
-        assert np.count_nonzero(~_without_contact(np.where(np.arange(30) < touched, 100.0, 0.0))) == left_out
-
-
 @pytest.mark.parametrize(("channel", "limit"), [(1, TOUCH_N), (4, TOUCH_NM)])
 def test_a_guarded_motion_has_contact_only_above_a_touch(channel: int, limit: float) -> None:
     residuals = np.zeros((9, 6))
     for size, left_out in ((0.95, 0), (1.05, 5)):
         residuals[4, channel] = -size * limit
         assert np.count_nonzero(~_untouched(residuals)) == left_out
-
-
-def test_noise_of_a_row_is_that_around_it() -> None:
-    unit, kept = np.ones((9, 6)), np.ones(9, np.bool_)
-    unit[4] = 5.0
-    kept[7] = False
-    unit[7] = 100.0
-    local = _local_noise(unit, kept)
-    burst = np.sqrt((1 + 1 + 25 + 1) / 4)
-    np.testing.assert_allclose(local, [1, 1, 1, burst, burst, burst, 1, 1, 1])
 
 
 def test_contact_is_first_judged_by_the_quiet_rows_of_each_state() -> None:
@@ -351,32 +304,6 @@ def test_a_walk_of_the_bias_is_found() -> None:
     assert (np.abs(change - walk[-1] + walk[0])[:3] < 4 * sigma[:3]).all()
     assert (sigma[:3] < 3 * 0.3 * np.sqrt(400 * ROW_S)).all()
     assert np.corrcoef(course[:, 2], walk[:, 2])[0, 1] > 0.9
-
-
-def test_another_mounting_costs_what_its_own_fit_does() -> None:
-    rows = rows_of(100, load_of(Truth()), seed=5, turn_rad=0.6, sigma=20 * SIGMA)
-    found = fit_motion(rows, None, G)
-    assert found.drift is None
-    assert found.kept.all()
-    np.testing.assert_allclose(found.sigma, np.tile(20 * SIGMA, (100, 1)), rtol=0.2)
-    assert found.distance.mean() == pytest.approx(6, rel=0.1)
-    expected = np.r_[np.full(6, found.load.mass_kg * GYRATION_M**2), HEIGHT_M, DELAY_S]
-    np.testing.assert_allclose(found.prior_share, np.sqrt(np.diag(found.covariance))[15:23] / expected)
-    costs = []
-    for start in Problem(rows, None, G, point_mass=False).starts():
-        load = start
-        for _ in range(8):
-            motion = rows.motion.earlier(load.delay_s, rows.rate)
-            left = (rows.wrench - wrench_of(load, motion)) / found.sigma
-            J = motion_jacobian(load, motion, rows.rate)[:, :, : GAINS.start] / found.sigma[:, :, None]
-            rows_of_prior = np.hstack([np.zeros((8, 15)), np.diag(1 / expected)])
-            y = np.append(left.ravel(), -load.vector[15 : GAINS.start] / expected)
-            step = np.linalg.lstsq(np.vstack([J.reshape(-1, GAINS.start), rows_of_prior]), y, rcond=None)[0]
-            load = load.moved(np.append(step, np.zeros(SIZE - GAINS.start)))
-        costs.append(float(y @ y))
-    assert len(costs) == 2
-    assert found.second_basin_chi2 == pytest.approx(max(costs) - min(costs), rel=0.05)
-    assert found.chi2 == pytest.approx(min(costs), rel=0.02)
 
 
 SECONDS = 15.0

@@ -12,7 +12,6 @@ from ftcalib.model import Parameters
 from ftcalib.motion.model import (
     SIZE,
     MovingLoad,
-    SmoothFunctions,
     lever_columns,
     motion_jacobian,
     turn_columns,
@@ -81,16 +80,6 @@ def test_turns_and_lever_are_derivatives() -> None:
         np.testing.assert_allclose(lever_columns(load, motion)[:, :, axis], expected, atol=1e-4)
 
 
-def test_smooth_functions_vary_over_the_recording_and_are_alike_nearby() -> None:
-    R = Rotation.from_euler("xyz", np.random.default_rng(2).uniform(-1, 1, (150, 3))).as_matrix()
-    functions = SmoothFunctions.of(R)
-    values = functions(R)
-    assert values.shape == (150, len(functions))
-    np.testing.assert_allclose(values.mean(axis=0), 0, atol=1e-9)
-    near = functions(R @ Rotation.from_rotvec([0.01, 0, 0]).as_matrix()) - values
-    assert (np.sum(near**2, axis=1) < 1e-3 * np.mean(np.sum(values**2, axis=1))).all()
-
-
 def test_a_sweep_gives_all_that_motion_shows(result: CalibrationResult) -> None:
     motion = result.motion
     assert motion is not None
@@ -111,14 +100,6 @@ def test_the_file_keeps_the_motion(result: CalibrationResult) -> None:
     assert result.motion is not None
     np.testing.assert_array_equal(again.motion.inertia_kg_m2, result.motion.inertia_kg_m2)
     assert again.sigma["delay_s"] == result.sigma["delay_s"]
-
-
-def test_gain_and_cross_talk_are_found() -> None:
-    gain = np.diag([0.03, -0.02, -0.01])
-    truth = replace(TRUTH, gain=gain, cross_talk_m=np.diag([1e-3, -5e-4, 5e-4]))
-    found = solve_motion(*means_of(record(truth, sweep(SWEEP_S), SWEEP_S, 2)))
-    assert found.response is not None
-    np.testing.assert_allclose(found.response.force_gain, gain, atol=2e-3)
 
 
 def test_contact_is_left_out_and_listed() -> None:

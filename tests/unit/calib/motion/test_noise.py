@@ -7,7 +7,7 @@ from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
 from ftcalib.model import Array
-from ftcalib.motion.model import FEWEST, ORDER, RowNoise, _filters, _of_equal_order, motion_states, places_in_runs
+from ftcalib.motion.model import FEWEST, RowNoise, _filters, motion_states, places_in_runs
 
 REST, SLOW, QUICK = np.zeros(100), np.linspace(0.1, 0.5, 150), np.linspace(0.6, 2.0, 150)
 
@@ -24,17 +24,6 @@ def test_rest_is_a_state_and_classes_of_speed_have_as_many_rows_each() -> None:
         state = motion_states(np.append(REST, np.linspace(0.03, 1, moving)), kept(100 + moving))
         assert np.bincount(state)[0] == 100
         assert state.max() == classes
-
-
-def test_states_that_few_kept_rows_show_are_joined_with_others() -> None:
-    speed = np.concatenate([REST[:FEWEST], SLOW])
-    assert np.bincount(motion_states(speed, kept(len(speed)))).tolist() == [FEWEST, 50, 50, 50]
-    unkept = kept(len(speed))
-    unkept[0] = False
-    assert np.bincount(motion_states(speed, unkept)).tolist() == [FEWEST + 50, 50, 50]
-    few_moving = np.concatenate([REST, SLOW[:FEWEST]])
-    assert np.bincount(motion_states(few_moving, kept(100 + FEWEST))).tolist() == [100, FEWEST]
-    assert not motion_states(few_moving[:-1], kept(99 + FEWEST)).any()
 
 
 def test_a_run_ends_at_a_gap() -> None:
@@ -63,17 +52,6 @@ def test_predictors_solve_the_equations_of_yule_and_walker() -> None:
         np.testing.assert_allclose(filters[k], np.pad(expected, (0, 3 - k)), rtol=1e-9)
 
 
-def test_the_order_is_that_of_least_bic_and_at_most_one_a_25_rows() -> None:
-    rng = np.random.default_rng(2)
-    place = np.arange(1500)
-    orders = [len(_filters(rng.normal(size=1500), place, bursts=False)) - 1 for _ in range(20)]
-    assert orders.count(0) >= 18
-    seventh = correlated(rng, 1500, *np.zeros(6), 0.4), correlated(rng, 1500, *np.zeros(5), 0.4)
-    assert [len(_filters(x, place, bursts=False)) - 1 for x in seventh] == [0, ORDER]
-    slow = np.sin(2 * np.pi * 0.1 * np.arange(74))  # predicted by two rows before
-    assert [len(_filters(slow[:n], place[:n], bursts=False)) - 1 for n in (24, 49, 74)] == [0, 1, 2]
-
-
 def test_weak_noise_at_low_frequencies_is_white_in_bursts() -> None:
     rng = np.random.default_rng(3)
     place = np.arange(1000)
@@ -82,13 +60,6 @@ def test_weak_noise_at_low_frequencies_is_white_in_bursts() -> None:
     assert [len(_filters(x, place, bursts=False)) for x in (low, high)] == [2, 2]
     constant = _filters(np.ones(1000), place, bursts=True)[1]
     np.testing.assert_allclose(constant[:2], [1 / np.sqrt(1 - 0.98**2), -0.98 / np.sqrt(1 - 0.98**2)])
-
-
-def test_a_channel_of_lower_order_keeps_its_last_predictor() -> None:
-    one, three = np.array([[2.0]]), np.array([[1.0, 0, 0], [1.1, -0.5, 0], [1.2, -0.6, 0.2]])
-    stacked = _of_equal_order([one, three])
-    np.testing.assert_array_equal(stacked[:, 1], three)
-    np.testing.assert_array_equal(stacked[:, 0], [[2.0, 0, 0]] * 3)
 
 
 def noisy(n: int = 1200) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
@@ -112,20 +83,6 @@ def test_rows_become_independent_and_of_unit_variance() -> None:
         unit = (r / common)[state == k]
         groups = np.sqrt([np.mean(unit[:, :3] ** 2), np.mean(unit[:, 3:] ** 2)])
         np.testing.assert_allclose(noise.scale[k], common * np.repeat(groups, 3))
-
-
-def test_a_row_is_predicted_from_those_before_it_in_its_run() -> None:
-    r, state, place = noisy()
-    noise = RowNoise.of(r, np.zeros((len(r), 6, 0)), state, place)
-    X = np.stack([r, 2 * r], axis=2)
-    white = noise.whiten(X, state, place)
-    order = len(noise.filters) - 1
-    assert order >= 1
-    for row in (0, 1, 5, 600, 601, 900):
-        seen = min(place[row], order)
-        values = [noise.filters[seen, :, lag] * r[row - lag] / noise.scale[state[row - lag]] for lag in range(seen + 1)]
-        np.testing.assert_allclose(white[row, :, 0], noise.root @ np.sum(values, axis=0))
-    np.testing.assert_allclose(white[:, :, 1], 2 * white[:, :, 0])
 
 
 def test_what_a_fit_has_taken_from_the_residuals_counts() -> None:

@@ -127,16 +127,6 @@ def test_a_gap_of_hours_costs_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     assert chunk.call_count <= 3
 
 
-def test_a_slow_stream_has_longer_gaps() -> None:
-    (t, values), poses = streams(12.0)
-    for period in (4, 8):
-        slow = slice(0, None, period)
-        rows = motion_rows((t, values), (t[slow], poses[1][slow]))
-        assert len(rows) == pytest.approx(len(motion_rows((t, values), poses)), abs=1)
-        R, expected = rows.motion.R_base_flange.reshape(-1, 9), rows.wrench[:, :9]
-        np.testing.assert_allclose(R, expected, atol=1e-4)
-
-
 def test_the_ends_that_both_streams_have_count() -> None:
     (t, values), (t_pose, poses) = streams(12.0)
     rows = motion_rows((t[150:], values[150:]), (t_pose[:1000], poses[:1000]), 0.02)
@@ -168,15 +158,6 @@ def test_means_weigh_samples_by_their_distance() -> None:
     assert means.samples == 400
     np.testing.assert_allclose(t_mean, weight @ t)
     np.testing.assert_allclose(mean, weight @ values, atol=1e-12)
-
-
-def test_samples_of_a_slow_stream_stay_what_they_are() -> None:
-    t, values = np.linspace(0.043, 1.963, 49), np.random.default_rng(1).standard_normal((49, 3))
-    means = Means()
-    means.add(t, values)
-    t_mean, mean = means.result()
-    np.testing.assert_allclose(t_mean, t)
-    np.testing.assert_allclose(mean, values)
 
 
 @pytest.mark.parametrize("wrong", ["time", "value", "nothing", "order"])

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +20,7 @@ from ftcalib.motion.solve import (
     _motion_findings,
     _narrow_findings,
     _other_wrench,
-    _range_deg,
     _require_enough_motion,
-    _residual_means,
     _select_rows,
 )
 from ftcalib.result import MotionResult
@@ -102,16 +100,6 @@ def test_a_fit_with_large_errors_is_not_determined(place: int, sigma: float, eno
         _require_enough_motion(about_one_axis(), best, None)
     if place == 2:
         _require_enough_motion(rows_of(60, TRUTH), best, None)  # the orientations would show it: the verdict names it
-
-
-def test_residuals_are_averaged_over_the_kept_rows_around() -> None:
-    residuals = np.arange(42.0).reshape(7, 6)
-    kept = np.array([True, True, False, True, False, False, False])
-    means = _residual_means(best_of(residuals=residuals, kept=kept), 3)
-    np.testing.assert_allclose(means[0], (residuals[0] + residuals[1]) / 2)
-    np.testing.assert_allclose(means[2], (residuals[1] + residuals[3]) / 2)
-    np.testing.assert_allclose(means[3], residuals[3])
-    np.testing.assert_allclose(means[6], 0)
 
 
 def test_contacts_are_listed_without_what_the_filter_spreads() -> None:
@@ -221,18 +209,3 @@ def test_a_wrench_without_weight_and_one_of_another_recording_are_named() -> Non
     ((code, values),) = named(other, 0.5 * other)
     assert (code, round(values["left_percent"])) == ("other_recording", 50)
     assert named(other, 0.25 * other) == []
-
-
-class FakeRows:
-    def __init__(self, rotation: Rotation) -> None:
-        self.motion = SimpleNamespace(R_base_flange=rotation.as_matrix())
-
-    def __len__(self) -> int:
-        return len(self.motion.R_base_flange)
-
-
-@pytest.mark.parametrize("half_deg", [5.0, 30.0, 80.0])
-def test_the_range_of_a_motion_is_that_from_end_to_end(half_deg: float) -> None:
-    turns = Rotation.from_rotvec(np.outer(np.linspace(-half_deg, half_deg, 41), [0.0, 0.6, 0.8]), degrees=True)
-    rows = cast(Any, FakeRows(Rotation.from_euler("xyz", [100, 20, -60], degrees=True) * turns))
-    assert _range_deg(rows) == pytest.approx(2 * half_deg, abs=0.01)

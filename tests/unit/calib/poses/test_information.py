@@ -9,9 +9,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, Setup, solve
-from ftcalib.errors import NotObservable
 from ftcalib.likelihood.structure import hidden_columns
-from ftcalib.model import Array, angle_between, jacobian, predict
+from ftcalib.model import Array, jacobian, predict
 from ftcalib.poses.information import (
     SUBSET_6,
     T12,
@@ -172,18 +171,6 @@ def test_a_guess_of_nothing_is_rejected(name: str) -> None:
         replace(GUESS, **{name: 0.0})  # type: ignore[arg-type]  # one of the numbers
 
 
-@pytest.mark.parametrize(("com_m", "lever_m"), [(0.0, 0.04), (0.03, 0.04), (0.05, 0.05)])
-def test_the_lever_is_that_of_the_tool_or_of_the_noise(com_m: float, lever_m: float) -> None:
-    guess = Guess(2.0, 0.1, 0.004, p_sensor_com_m=(0, -com_m, 0), g_m_s2=10.0)
-    assert_allclose(guess.scale, np.repeat([1, 20, 20, lever_m, 20 * lever_m], 3))
-
-
-def test_a_centre_of_mass_near_the_sensor_is_observable() -> None:
-    for com_m in (0.0, 1e-7, 1e-3):
-        prediction = predicted_sigma(ALL, replace(GUESS, p_sensor_com_m=(0, 0, com_m)))
-        assert_allclose(prediction.sigma["p_sensor_com_m"], np.sqrt(1.5 / 24) * 0.005 / 20, rtol=1e-3)
-
-
 # ---- the second basin
 
 
@@ -209,30 +196,6 @@ def test_a_centre_of_mass_near_the_sensor_is_observable() -> None:
 )
 def test_published_gaps(R_base_flange: Array, gap: float, atol: float) -> None:
     assert_allclose(second_basin(R_base_flange, GUESS)[0], gap, atol=atol)
-
-
-@pytest.mark.parametrize("turn_rad", [0.0, 0.3, 0.6])
-def test_the_second_solution_of_an_ambiguous_set_is_not_the_true_one(turn_rad: float) -> None:
-    turned = Rotation.from_rotvec([0, 0, turn_rad]).as_matrix() @ special(AMBIGUOUS_6)
-    gap, other = second_basin(turned, GUESS)
-    assert gap < 1e-9
-    assert other is not None
-    assert angle_between(other.R_flange_sensor, GUESS.parameters.R_flange_sensor) > 0.1
-
-
-def test_the_set_of_six_without_a_gap_is_really_ambiguous() -> None:
-    rng = np.random.default_rng(3)
-    guess = Guess(1.0, 0.05, 0.003, p_sensor_com_m=(0.01, -0.02, 0.07), tilt_alpha_rad=0.05, tilt_beta_rad=0.03)
-    cov = np.tile(np.diag(guess.wrench_sigma**2), (6, 1, 1))
-    verdicts: list[str] = []
-    for R in (special(AMBIGUOUS_6), special(SUBSET_6), optimised(6)):
-        wrench = predict(guess.parameters, R) + guess.wrench_sigma * rng.normal(size=(6, 6))
-        try:
-            dataset = CalibrationDataset(R, wrench, cov, np.full(6, 100), np.arange(6.0))
-            verdicts.append(solve(dataset, setup=Setup(sensor_accuracy_percent=0.0)).verdict)
-        except NotObservable:
-            verdicts.append("refused")
-    assert verdicts == ["refused", "good", "good"]
 
 
 # ---- stored sets

@@ -109,14 +109,6 @@ def test_every_published_method_is_compared() -> None:
     assert sorted(METHODS) == sorted(PUBLISHED)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize(("method", "as_published"), CASES)
-def test_both_find_the_truth_without_noise(method: str, as_published: bool, seed: int) -> None:
-    truth = _truth(method, seed, bias=not as_published)
-    for found in _estimates(method, truth, _poses(method, seed), as_published=as_published):
-        _assert_equal(found, truth)
-
-
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in SEEDS[2:])])
 @pytest.mark.parametrize(("method", "as_published"), CASES)
 def test_both_find_the_same_estimate_with_noise(method: str, as_published: bool, seed: int) -> None:
