@@ -87,20 +87,6 @@ def test_a_solved_calibration_can_be_updated() -> None:
     assert tare(result, R[:1], [dwell(truth(), R[0], rng)]).covariance.shape == (15, 15)
 
 
-def drifted(parameters: Parameters, force_N: Array, torque_Nm: Array) -> Parameters:
-    return parameters.moved(np.concatenate([np.zeros(6), force_N, np.zeros(3), torque_Nm]))
-
-
-def test_a_tare_takes_up_drift_in_any_pose() -> None:
-    rng = np.random.default_rng(4)
-    now = drifted(truth(), np.array([0.5, -0.8, 2.0]), np.array([0.01, 0.02, -0.02]))
-    R = tilted(77)
-    update = tare(exact(truth()), R, [dwell(now, R[0], rng)])
-    assert update.dof == 0
-    np.testing.assert_allclose(update.parameters.force_bias_N, now.force_bias_N, atol=5 * 0.05 / np.sqrt(200))
-    np.testing.assert_allclose(update.parameters.torque_bias_Nm, now.torque_bias_Nm, atol=5 * 0.00125 / np.sqrt(200))
-
-
 def test_the_covariance_of_a_tare_covers_noise_and_the_old_errors() -> None:
     rng = np.random.default_rng(5)
     R = tilted(20, 70)

@@ -207,19 +207,6 @@ def test_the_covariance_of_a_tool_with_a_part_has_the_errors_of_both(gain: bool)
     assert_same(found.covariance if found.response is None else found.response.covariance, expected)
 
 
-def test_one_pose_shows_the_centre_of_mass_only_across_gravity() -> None:
-    gripper = Gripper(4)
-    R = gripper.turn()
-    weight = gripper.weigh(calibrated(), R)
-    u = gripper.part(R)[:3] / np.linalg.norm(gripper.part(R)[:3])
-    assert weight.line is not None
-    assert abs(weight.line @ u) == pytest.approx(1, abs=1e-3)
-    assert weight.line @ weight.com_covariance @ weight.line == pytest.approx(0.1**2, rel=0.02)
-    assert np.sqrt(np.linalg.eigvalsh(weight.com_covariance)[:2]).max() < 5e-3
-    assert abs((weight.p_sensor_com_m - NEAR) @ u) < 0.02
-    assert (weight.dof, weight.poses) == (5, 1)
-
-
 def test_a_tool_with_a_part_predicts_both() -> None:
     z2 = []
     for seed in range(40):

@@ -14,14 +14,11 @@ from ftcalib import CalibrationDataset, CalibrationResult, Finding, Parameters, 
 from ftcalib.judge.faults import faults
 from ftcalib.judge.verdict import (
     Case,
-    DriftAhead,
     Quality,
-    _drift_findings,
-    _structure_in_motion,
     strong_correlations,
 )
 from ftcalib.likelihood.fit import Estimate
-from ftcalib.model import Array, DriftResult, SPECIAL_R_flange_base, jacobian, predict
+from ftcalib.model import Array, SPECIAL_R_flange_base, jacobian, predict
 from ftcalib.solver import _judge
 from ftdrive import read_dataset
 from tests.known_cells import SIGMA, white
@@ -303,31 +300,11 @@ def test_inverted_orientations_are_detected() -> None:
     assert (result.verdict, result.findings[0].code) == ("rejected", "orientations_inverted")
 
 
-@pytest.mark.parametrize(
-    ("factor", "code", "distance", "suspects"),
-    [
-        (1e3, "com_too_far", 73.5, [["N", "N·mm"], ["kN", "N·m"]]),
-        (1e-3, "com_too_near", 0.074, None),
-        (10, "com_too_far", 0.735, [["N", "lbf·in"], ["lbf", "N·m"], ["kgf", "N·m"]]),
-    ],
-)
-def test_wrong_units_of_torque_are_detected(
-    factor: float, code: str, distance: float, suspects: list[object] | None
-) -> None:
-    wrench = noisy(np.random.default_rng(22), R24)
-    result = solved(R24, wrench * np.repeat([1, factor], 3))
-    assert result.verdict == ("usable" if factor < 1 else "rejected")
-    values = the(code, result).values
-    assert values["distance_mm" if factor < 1 else "distance_m"] == pytest.approx(distance, rel=0.02)
-    assert values.get("units") == suspects
-
-
 # Limits
 
 
 FITTED = fit(R24, noisy(np.random.default_rng(30), R24), white(24))
 WEIGHT_N = FITTED.parameters.weight_N
-OF_20_N = replace(FITTED, parameters=replace(TRUTH, gravity_force_base_N=np.array([0, 0, -20.0])))
 
 
 def statistics(**values: Any) -> Quality:
@@ -375,21 +352,6 @@ def test_a_smooth_error_limits_from_a_fifth_of_a_percent_of_the_weight_on(
     assert [(one.code, one.severity) for one in named if one.code in SMOOTH] == found
 
 
-@pytest.mark.parametrize(
-    ("components", "found"),
-    [
-        ({"load_N": 0.0004 * WEIGHT_N, "cable_N": 0.0004 * WEIGHT_N, "yielding_rad": 4e-4, "rotation_rad": 9e-4}, []),
-        ({"load_Nm": 0.0006 * WEIGHT_N * 0.1}, ["response_not_linear"]),
-        ({"cable_N": 0.0006 * WEIGHT_N}, ["cable_acts"]),
-        ({"yielding_rad": 6e-4}, ["orientations_smoothly_off"]),
-        ({"rotation_rad": 1.1e-3}, ["orientations_smoothly_off"]),
-    ],
-)
-def test_in_motion_a_smooth_error_is_named_only_where_it_limits(components: dict[str, float], found: list[str]) -> None:
-    named = _structure_in_motion(replace(FITTED, components=components))
-    assert [(one.code, one.severity) for one in named] == [(code, "limit") for code in found]
-
-
 def test_the_next_use_has_the_noise_that_explains_the_residuals_or_else_those_of_left_out_poses() -> None:
     wrench = noisy(np.random.default_rng(32), R24)
     measured, unknown = fit(R24, wrench, white(24)), fit(R24, wrench)
@@ -399,32 +361,6 @@ def test_the_next_use_has_the_noise_that_explains_the_residuals_or_else_those_of
     assert [quality.uses[name] for name in names] == pytest.approx([*expected])
     left_out = other.loo_force_rms_N, other.loo_torque_rms_Nm
     assert [other.uses[name] for name in names] == pytest.approx([*left_out])
-
-
-@pytest.mark.parametrize(
-    ("change", "is_cause", "found"),
-    [
-        ([0.029, 0, 0, 0, 0, 0], True, None),
-        ([0.031, 0, 0, 0, 0, 0], True, ("note", 0.031, 0.0)),
-        ([0.39, 0, 0, 0, 0, 0], True, ("note", 0.39, 0.0)),
-        ([0.41, 0, 0, 0, 0, 0], True, ("limit", 0.41, 0.0)),
-        ([0.41, 0, 0, 0, 0, 0], False, ("note", 0.41, 0.0)),
-        ([0, 0, 0, 0, 0.039, 0], True, ("note", 0.0, 0.039)),
-        ([0, 0, 0, 0, 0.041, 0], True, ("limit", 0.0, 0.041)),  # at the lever 0.41 N
-    ],
-)
-def test_a_drift_is_named_from_three_sigmas_on_and_limits_from_two_percent_of_the_weight(
-    change: list[float], is_cause: bool, found: tuple[str, float, float] | None
-) -> None:
-    drift = DriftResult(np.array(change), np.repeat([0.01, 0.001], 3), np.zeros((2, 6)))
-    ahead = DriftAhead(*np.zeros((3, 6)))
-    drifting = replace(OF_20_N, drift=drift)
-    findings = _drift_findings(drifting, ahead, is_cause=is_cause)
-    named = [(one.severity, one.values["force_N"], one.values["torque_Nm"]) for one in findings]
-    assert named == ([] if found is None else [found])
-    if change[4]:
-        still = DriftAhead(np.zeros(6), *[np.array([0, 0, 0, 0, 0.041**2, 0])] * 2)
-        assert _drift_findings(drifting, still, is_cause=True)[0].severity == "limit"
 
 
 # Real sessions

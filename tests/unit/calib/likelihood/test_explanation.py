@@ -9,14 +9,13 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from ftcalib.likelihood import explanation
 from ftcalib.likelihood.descent import Kept, agreeing_poses, fewest_kept
-from ftcalib.likelihood.explanation import _are_gaussian, _criterion, _limit, _membership, _stand_out
+from ftcalib.likelihood.explanation import _are_gaussian, _criterion, _limit, _stand_out
 from ftcalib.likelihood.session import SessionData, inverses
 from ftcalib.likelihood.variance_components import FORCE, Component, Point, channel_component, point
 from ftcalib.model import Array
 from tests.unit.calib.likelihood.sessions import R24, SIGMA_N, SIGMA_NM, TOOL, session
 
 SIGMA = np.repeat([SIGMA_N, SIGMA_NM], 3)
-FARTHEST = stats.chi2.isf(1e-3, 6)
 
 
 def tour(n: int, residuals: Array | float = 0.0) -> SessionData:
@@ -65,26 +64,6 @@ def test_noise_is_gaussian_where_its_distribution_is(n: int, off: float, gaussia
     critical = stats.kstwobign.isf(0.01) / np.sqrt(n)
     share = np.maximum((np.arange(n) + 0.5) / n - off * critical, 1e-12)
     assert _are_gaussian(tour(n), stats.chi2.ppf(share, 6)) == gaussian
-
-
-def test_the_worst_are_rejected_first_and_taken_back_when_they_fit() -> None:
-    own, everything = tour(24), np.ones(24, bool)
-
-    def rejected(kept: Kept, **distances: float) -> list[int]:
-        values = np.full(24, 6.0)
-        for row, value in distances.items():
-            values[int(row[1:])] = value
-        return np.flatnonzero(~_membership(own, kept, values, at(own, kept))).tolist()
-
-    near, far = 0.99 * FARTHEST, 1.01 * FARTHEST
-    assert rejected(everything, p3=far, p5=near) == [3]
-    assert rejected(everything, p3=far, p5=100.0, p7=26.0) == [5, 7]  # a quarter of the worst is 25
-    before = everything.copy()
-    before[[1, 2]] = False
-    assert rejected(before, p1=near, p2=far) == [2]
-    assert rejected(before, p1=1000.0, p2=far, p3=far) == [1, 2, 3]  # the worst of the used ones counts
-    assert rejected(before, **{f"p{k}": far for k in range(9)}) == list(range(9))
-    assert rejected(before, **{f"p{k}": far for k in range(10)}) == [1, 2]  # too many: nothing changes
 
 
 @pytest.mark.parametrize("scale", [1.0, 10.0, 30.0])

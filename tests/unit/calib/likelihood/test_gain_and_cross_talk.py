@@ -168,15 +168,3 @@ def test_it_is_found_along_the_axes_that_have_it() -> None:
 def test_a_damaged_response_is_refused() -> None:
     with pytest.raises(ValueError, match="coefficients"):
         Response(np.zeros(10), np.eye(26))
-
-
-def test_sigmas_of_the_entries_are_those_of_their_coefficients() -> None:
-    rng = np.random.default_rng(1)
-    A = rng.normal(size=(26, 30))
-    response = Response(rng.normal(size=11), A @ A.T)
-    drawn = rng.multivariate_normal(np.zeros(11), response.covariance[15:, 15:], 20_000)
-    for name, entries in (
-        ("force_gain", np.tensordot(drawn[:, :5], GAIN, 1)),
-        ("cross_talk_m", np.tensordot(drawn[:, 5:], CROSS_TALK_M, 1)),
-    ):
-        np.testing.assert_allclose(response.sigma[name], entries.std(axis=0), rtol=0.03)

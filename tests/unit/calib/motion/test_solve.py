@@ -16,7 +16,6 @@ from ftcalib.motion.samples import Motion, MotionRows
 from ftcalib.motion.solve import (
     SLOW_RAD_S,
     _coarse_delay,
-    _contacts,
     _motion_findings,
     _narrow_findings,
     _other_wrench,
@@ -100,19 +99,6 @@ def test_a_fit_with_large_errors_is_not_determined(place: int, sigma: float, eno
         _require_enough_motion(about_one_axis(), best, None)
     if place == 2:
         _require_enough_motion(rows_of(60, TRUTH), best, None)  # the orientations would show it: the verdict names it
-
-
-def test_contacts_are_listed_without_what_the_filter_spreads() -> None:
-    rows = rows_of(60, TRUTH)
-    residuals, kept = np.zeros((60, 6)), np.ones(60, np.bool_)
-    kept[8:17], kept[38:45], kept[55:57] = False, False, False
-    residuals[9:16, 1], residuals[11:14, 1], residuals[12, 0] = 2.0, -6.0, 8.0
-    residuals[40:43, 4] = [0.3, 0.4, 0.3]
-    residuals[20, 2] = 100.0  # kept
-    first, second = _contacts(rows, best_of(residuals=residuals, kept=kept), 1.0)
-    assert first == pytest.approx({"t_s": 10.5 * ROW_S - 1, "duration_s": 3 * ROW_S, "force_N": 10.0, "torque_Nm": 0.0})
-    assert second == pytest.approx({"t_s": 39.5 * ROW_S - 1, "duration_s": 3 * ROW_S, "force_N": 0.0, "torque_Nm": 0.4})
-    assert _contacts(rows, best_of(kept=np.ones(60, np.bool_)), 0.0) == ()
 
 
 def motion_result(delay_s: float = 0.0, contacts: tuple[Any, ...] = ()) -> MotionResult:

@@ -26,7 +26,6 @@ from ftcalib.poses.selection import (
     WEIGHT_OF_PLANE,
     choose,
     cone_candidates,
-    greedy_and_exchange,
     next_pose,
 )
 from ftcalib.sensor_matrix import SensorMatrix, response_columns
@@ -60,11 +59,6 @@ def row(R_base_flange: Array, guess: Guess = FORCES_ONLY) -> list[float]:
 def tilted(tilt_deg: float, azimuth_deg: float, spin_deg: float) -> Array:
     turn = Rotation.from_euler("ZYZ", [azimuth_deg, tilt_deg, spin_deg], degrees=True).as_matrix()
     return np.asarray(turn @ TOOL_DOWN_R_base_flange)
-
-
-def ball(half_angle_deg: float, m: int, rng: np.random.Generator) -> Array:
-    turns = Rotation.random(200 * m, rng=rng)
-    return np.asarray(turns[turns.magnitude() <= np.deg2rad(half_angle_deg)][:m].as_matrix() @ TOOL_DOWN_R_base_flange)
 
 
 # ---- predictions
@@ -225,21 +219,6 @@ def test_cone_candidates_fill_the_cone() -> None:
         cone_candidates(0.0)
 
 
-@pytest.mark.parametrize("n", [6, pytest.param(12, marks=pytest.mark.slow)])
-def test_chosen_poses_beat_random_ones(n: int) -> None:
-    rng = np.random.default_rng(n)
-    candidates = ball(40, 500, rng)
-    chosen = choose(candidates, n, GUESS)
-    assert len(set(chosen.tolist())) == n
-    assert_allclose(chosen, choose(candidates, n, GUESS))
-    assert second_basin(candidates[chosen], GUESS)[0] >= 0.02
-    mine = efficiency(candidates[chosen], GUESS)
-    others = np.array([efficiency(candidates[rng.choice(500, n, replace=False)], GUESS) for _ in range(50)])
-    assert others[:, 1].max() < mine.A
-    assert others[:, 2].max() < mine.I_F
-    assert 1.5 * np.median(others[:, 1]) < mine.A
-
-
 def test_a_rim_gets_centre_poses() -> None:
     rim = np.array([tilted(40, a, s) for a in range(0, 360, 15) for s in range(0, 360, 60)])
     centre = np.array([tilted(0, 0, s) for s in range(0, 360, 60)])
@@ -292,28 +271,6 @@ def test_next_pose_is_the_best_by_brute_force() -> None:
     cost = [(p.force_rms_N / 0.2) ** 2 + (p.torque_rms_Nm / 0.005) ** 2 for p in predictions]
     in_order = np.array(cost)[ranked]
     assert (np.diff(in_order) > -1e-3 * in_order[1:]).all()
-
-
-@pytest.mark.parametrize("pinned", [(), (3, 8)])
-def test_no_exchange_of_one_candidate_improves_a_choice(pinned: tuple[int, ...]) -> None:
-    rows = np.random.default_rng(5).normal(size=(14, 4)) * [3.0, 1.0, 1.0, 0.3]
-
-    def error(chosen: list[int]) -> float:
-        return float(np.trace(np.linalg.inv(1e-3 * np.eye(4) + rows[chosen].T @ rows[chosen])))
-
-    def gains(chosen: list[int]) -> Array:
-        return np.array([error(chosen) - error([*chosen, k]) for k in range(len(rows))])
-
-    found = greedy_and_exchange(gains, 5, pinned).tolist()
-    assert tuple(found[: len(pinned)]) == pinned
-    assert len(set(found)) == 5
-    others = [k for k in range(14) if k not in found]
-    exchanged = [error([*found[:i], k, *found[i + 1 :]]) for i in range(len(pinned), 5) for k in others]
-    assert min(exchanged) >= error(found)
-    greedy = list(pinned)
-    while len(greedy) < 5:
-        greedy.append(max((k for k in range(14) if k not in greedy), key=lambda k: gains(greedy)[k]))
-    assert error(found) < 0.999 * error(greedy)
 
 
 def test_a_choice_is_a_local_optimum_of_its_criterion() -> None:
