@@ -38,7 +38,7 @@ def assert_same(one: CalibrationResult, other: Parameters, within_sigma: float =
     np.testing.assert_array_less(np.abs(one.parameters.difference(other)) / sigma, within_sigma)
 
 
-@settings(max_examples=4)
+@settings(max_examples=2)
 @given(seeds)
 def test_an_added_bias_is_an_added_bias(seed: int) -> None:
     R, wrench, cov = poses(seed)
@@ -54,7 +54,7 @@ def test_an_added_bias_is_an_added_bias(seed: int) -> None:
     assert_same(answer(R, wrench + added, cov), moved)
 
 
-@settings(max_examples=4)
+@settings(max_examples=2)
 @given(seeds, st.floats(0.01, 100))
 def test_other_units_of_force_scale_weight_and_bias_and_leave_geometry(seed: int, unit: float) -> None:
     R, wrench, cov = poses(seed)
@@ -72,7 +72,7 @@ def test_other_units_of_force_scale_weight_and_bias_and_leave_geometry(seed: int
     assert other.verdict == one.verdict
 
 
-@settings(max_examples=4)
+@settings(max_examples=2)
 @given(seeds)
 def test_another_origin_of_the_sensor_moves_the_centre_of_mass_and_the_torques(seed: int) -> None:
     R, wrench, cov = poses(seed)

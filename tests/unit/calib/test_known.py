@@ -16,7 +16,6 @@ TOOL = Parameters(
     MOUNT, np.array([4.0, -3.0, -18.0]), np.array([3.0, -2, 8]), np.array([0.03, -0.02, 0.06]), np.array([0.1, 0.2, 0])
 )
 DOWN = np.array([0.3, -0.4, -1.2])
-ALL = {"R_flange_sensor": MOUNT, "gravity_direction_base": DOWN, "mass_kg": 2.0}
 
 
 def step(k: int) -> Array:
@@ -55,11 +54,9 @@ def angle_between_directions(a: Array, b: Array) -> float:
     ("known", "fixed"),
     [
         (Known(), 0),
-        (Known(R_flange_sensor=MOUNT), 3),
         (Known(R_flange_sensor=MOUNT, yaw_only=True), 2),
         (Known(gravity_direction_base=DOWN), 2),
         (Known(mass_kg=2.0), 1),
-        (Known(gravity_direction_base=DOWN, mass_kg=2.0), 3),
         (Known(R_flange_sensor=MOUNT, gravity_direction_base=DOWN, mass_kg=2.0), 6),
     ],
 )
@@ -103,7 +100,7 @@ def test_starts_respect_the_known_mounting() -> None:
     assert len(Constraints(Known(R_flange_sensor=MOUNT, R_tolerance_rad=0.1), 9.8).rotations(minima, none)) == 4
 
 
-@pytest.mark.parametrize("angle_rad", [0.3, 2.0, 5.5])
+@pytest.mark.parametrize("angle_rad", [0.3, 5.5])
 def test_yaw_starts_near_the_two_lowest_of_twelve_times_two_angles(angle_rad: float) -> None:
     """The cost of a turn is `-cos(2 (angle - least)) - 0.1 cos(angle - least)`: two minima, the first the lower."""
     z, here = np.array([0.0, 0, 1]), np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0])
@@ -125,7 +122,7 @@ def test_yaw_starts_near_the_two_lowest_of_twelve_times_two_angles(angle_rad: fl
     assert len(Constraints(soft, 9.8).rotations([MOUNT], (Q + Q.T) / 2)) == 3
 
 
-@pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1e-3, 1.0, 3.0, np.pi])
+@pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1.0, np.pi])
 def test_the_smallest_turn_between_vectors(angle_rad: float) -> None:
     a, b = np.array([0.0, 0.6, 0.8]), np.array([1.0, 0.0, 0.0])
     b = np.cos(angle_rad) * a + np.sin(angle_rad) * b

@@ -1,5 +1,6 @@
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,7 @@ def test_a_weighed_tool_shows_the_gain_common_to_all_axes() -> None:
     assert sigma[1] < 0.7 * sigma[0]
 
 
+@cache
 def solved() -> CalibrationResult:
     (tool,) = LoadedSensor(1).runs([TOOL])
     described = Setup(

@@ -99,7 +99,7 @@ def test_the_covariance_of_a_tare_covers_noise_and_the_old_errors() -> None:
         assert np.mean(distances) == pytest.approx(15, rel=0.2)  # covariances of 40 samples are themselves uncertain
 
 
-@pytest.mark.parametrize("push", [[0, 0, 8, 0, 0, 0], [5, 5, 0, 0, 0, 0], [0, 0, 0, 0, 0.2, 0]])
+@pytest.mark.parametrize("push", [[0, 0, 8, 0, 0, 0], [0, 0, 0, 0, 0.2, 0]])
 def test_a_tare_under_load_is_rejected(push: list[float]) -> None:
     R = tilted(30)
     reading = dwell(truth(), R[0], np.random.default_rng(7)) + push

@@ -64,8 +64,7 @@ def verified(parameters: Parameters, n: int = 6, seed: int = 3, *, gain: bool = 
     return verify_calibration(calibrated(gain=gain), orientations(n), wrench, noise_of(n))
 
 
-@pytest.mark.parametrize("gain", [False, True])
-@pytest.mark.parametrize("n", [2, 6])
+@pytest.mark.parametrize(("n", "gain"), [(2, True), (6, False)])
 def test_an_unchanged_cell_passes(n: int, gain: bool) -> None:
     found = verified(TRUTH, n, gain=gain)
     assert found.passed
@@ -74,8 +73,7 @@ def test_an_unchanged_cell_passes(n: int, gain: bool) -> None:
     json.dumps(found.to_dict(), allow_nan=False)
 
 
-@pytest.mark.parametrize("gain", [False, True])
-@pytest.mark.parametrize("what", CHANGED)
+@pytest.mark.parametrize(("what", "gain"), [*((what, False) for what in CHANGED), ("payload", True)])
 def test_a_change_is_named_and_the_smallest_update_makes_up_for_it(what: str, gain: bool) -> None:
     found = verified(CHANGED[what], gain=gain)
     assert not found.passed
@@ -233,7 +231,7 @@ def smoothly_turned(R: Array, seed: int) -> Array:
     return np.asarray(R @ Rotation.from_rotvec(R.reshape(-1, 9) @ weights.T).as_matrix())
 
 
-@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 4), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(1)])
 def test_smooth_errors_of_an_arm_are_no_change_in_other_poses_and_hide_none(seeds: range) -> None:
     passed, changes = 0, ("bias", "payload", "centre of mass")
     for seed in seeds:

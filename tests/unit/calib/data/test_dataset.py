@@ -112,7 +112,7 @@ def test_what_is_wrong_is_said_with_its_row(changes: dict[str, Any], snapshot: S
     assert wording(caught.value) == snapshot
 
 
-@pytest.mark.parametrize("decimals", [3, 4, 6])
+@pytest.mark.parametrize("decimals", [3, 6])
 def test_rounded_rotations_are_put_back_onto_so3(decimals: int) -> None:
     exact = Rotation.random(500, rng=np.random.default_rng(1)).as_matrix()
     data = CalibrationDataset(

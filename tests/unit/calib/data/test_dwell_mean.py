@@ -26,20 +26,13 @@ def noise(rng: np.random.Generator, N: int, rho: Array) -> Array:
 MIXED = [0, 0.5, 0.9, 0, 0.9, 0.5]
 
 
-@pytest.mark.parametrize(
-    ("N", "rho"),
-    [
-        *((400, rho) for rho in ([0.0] * 6, [0.9] * 6, MIXED)),
-        pytest.param(7000, MIXED, marks=pytest.mark.slow),
-        (1500, [-0.5] * 6),
-    ],
-)
+@pytest.mark.parametrize(("N", "rho"), [(400, [0.9] * 6), (1500, [-0.5] * 6), (400, MIXED)])
 def test_the_mean_lies_where_its_covariance_states(N: int, rho: list[float]) -> None:
     rng = np.random.default_rng(N)
     lag = np.arange(1, N)
     variance = np.array([1 + 2 * np.sum((1 - lag / N) * r**lag) for r in rho]) / N
     z, ratio = [], []
-    for _ in range(100 if N < 5000 else 40):
+    for _ in range(100):
         pose = mean_and_covariance(5.0 + noise(rng, N, np.array(rho)))
         z.append((pose.mean - 5.0) / np.sqrt(np.diag(pose.covariance)))
         ratio.append(np.diag(pose.covariance) / variance)
@@ -49,14 +42,13 @@ def test_the_mean_lies_where_its_covariance_states(N: int, rho: list[float]) -> 
     assert (0.88 if hard else 0.92) < coverage < 0.98
 
 
-@pytest.mark.parametrize("rho", [0.0, 0.8])
-def test_correlation_between_channels_is_kept(rho: float) -> None:
+def test_correlation_between_channels_is_kept() -> None:
     """Of channels as unlike in size as newtons and newton metres, in the samples and in their mean."""
     sigma = np.repeat([0.3, 0.004], 3)
     mixing = np.eye(6)
     mixing[4, [0, 4]] = 0.8, 0.6
     rng = np.random.default_rng(1)
-    found = [mean_and_covariance(noise(rng, 500, np.full(6, rho)) @ mixing.T * sigma) for _ in range(150)]
+    found = [mean_and_covariance(noise(rng, 500, np.full(6, 0.8)) @ mixing.T * sigma) for _ in range(150)]
     correlations = [C[0, 4] / np.sqrt(C[0, 0] * C[4, 4]) for C in (pose.covariance for pose in found)]
     assert np.median(correlations) == pytest.approx(0.8, abs=0.02)
     difference = np.array([1, 0, 0, 0, -1, 0]) / sigma  # of which correlation takes most of the spread away
@@ -65,7 +57,7 @@ def test_correlation_between_channels_is_kept(rho: float) -> None:
     np.testing.assert_array_equal(found[0].covariance, found[0].covariance.T)
 
 
-@pytest.mark.parametrize("sigma", [0.25, 0.4, 0.7, 1.5])
+@pytest.mark.parametrize("sigma", [0.25, 0.7])
 def test_averaging_cannot_see_through_coarse_steps(sigma: float) -> None:
     rng = np.random.default_rng(2)
     z = []
@@ -90,9 +82,8 @@ def test_a_channel_that_never_moves_or_copies_another_leaves_a_usable_covariance
     np.testing.assert_allclose(np.sqrt(np.diag(silent)), [1e-3] * 3 + [2.5e-5] * 3)
 
 
-@pytest.mark.parametrize("N", [400, 7000])
-def test_a_drift_or_a_decay_of_any_channel_fails(N: int) -> None:
-    rng = np.random.default_rng(5)
+def test_a_drift_or_a_decay_of_any_channel_fails() -> None:
+    rng, N = np.random.default_rng(5), 400
     t = np.linspace(0, 1, N)
     standard_error = 1 / np.sqrt(N)
     for channel in range(6):
@@ -117,12 +108,11 @@ def filtered(rng: np.random.Generator, seconds: float, corner_Hz: float) -> Arra
     return samples
 
 
-@pytest.mark.parametrize("corner_Hz", [5, pytest.param(1e9, marks=pytest.mark.slow)])
-def test_a_sensor_left_alone_is_quiet(corner_Hz: float) -> None:
+def test_a_sensor_left_alone_is_quiet() -> None:
     rng = np.random.default_rng(17)
-    level = noise_level(filtered(rng, 20, corner_Hz), 1000)
-    alarms = np.mean([not is_quiet(filtered(rng, 2, corner_Hz), level) for _ in range(200)])
-    assert alarms < 0.015  # with a threshold of 3 standard errors 4 % and 13 %
+    level = noise_level(filtered(rng, 20, 5), 1000)
+    alarms = np.mean([not is_quiet(filtered(rng, 2, 5), level) for _ in range(200)])
+    assert alarms < 0.015  # with a threshold of 3 standard errors 4 %
 
 
 @pytest.mark.parametrize(
@@ -202,7 +192,7 @@ def by_definition(x: Array, m: int) -> float:
     return float(np.sqrt(np.mean([(b - a) ** 2 for a, b in zip(means, means[m:], strict=False)]) / 2))
 
 
-@pytest.mark.parametrize("kind", ["white", "walk", "offset"])
+@pytest.mark.parametrize("kind", ["walk", "offset"])
 def test_it_is_the_definition(kind: str) -> None:
     wrench = white(1)
     if kind == "walk":
@@ -220,8 +210,8 @@ def test_lengths_that_do_not_fit_are_rejected(lengths: list[int]) -> None:
         allan_deviation(white(1), lengths)
 
 
-@pytest.mark.parametrize("seconds", [2.0, 7.5])
-def test_white_noise_is_averaged_as_long_as_the_target_asks(seconds: float) -> None:
+def test_white_noise_is_averaged_as_long_as_the_target_asks() -> None:
+    seconds = 7.5
     target = SIGMA[0] / np.sqrt(seconds * RATE_HZ)
     times = [chosen(white(120, seed), force_N=target).seconds for seed in range(7)]
     assert np.median(times) == pytest.approx(seconds, rel=0.25)  # the worst of three channels decides

@@ -48,15 +48,11 @@ def codes(result: CalibrationResult) -> list[str]:
 # ---------------------------------------------------------------------------------------------- directions of a session
 
 
-@pytest.mark.parametrize("shift", [-1, 1])
-@pytest.mark.parametrize("measured", [True, False])
-def test_an_inverted_quaternion_in_another_order_is_not_good_unless_its_mounting_is_declared(
-    shift: int, measured: bool
-) -> None:
+def test_an_inverted_quaternion_in_another_order_is_not_good_unless_its_mounting_is_declared() -> None:
     data = sound()
     quaternions = Rotation.from_matrix(np.swapaxes(data.R_base_flange, 1, 2)).as_quat()
-    R = Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix()
-    wrong = CalibrationDataset(R, data.wrench, data.wrench_cov if measured else None, data.n_samples, data.t_s)
+    R = Rotation.from_quat(np.roll(quaternions, 1, axis=1)).as_matrix()
+    wrong = CalibrationDataset(R, data.wrench, data.wrench_cov, data.n_samples, data.t_s)
     result = solve(wrong)
     assert (result.verdict, codes(result)[0]) == ("usable", "mounting_undeclared")
     fix = result.findings[0].fix
@@ -67,7 +63,7 @@ def test_an_inverted_quaternion_in_another_order_is_not_good_unless_its_mounting
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.5, 0, 0.866)])
-@pytest.mark.parametrize("heading_deg", range(0, 360, 15))
+@pytest.mark.parametrize("heading_deg", [0, 100, 205])
 def test_the_low_side_is_named(up: tuple[float, ...], heading_deg: float) -> None:
     # Tip the mounted base over the horizontal direction `heading` of the world, as a floor that gives way there.
     other = np.array([0.0, 1.0, 0.0])
@@ -87,7 +83,6 @@ def test_the_low_side_is_named(up: tuple[float, ...], heading_deg: float) -> Non
 @pytest.mark.parametrize(
     ("angle_deg", "sigma_N", "significant"),
     [
-        (0, 0.001, False),
         (0.9 * LEAN_DEG, 0.001, False),
         (1.1 * LEAN_DEG, 0.001, True),
         (1, 12 * np.radians(1) / 3.9, False),
@@ -122,11 +117,8 @@ def tilted(angle_deg: float) -> Parameters:
     [
         (0.1, None, None),
         (0.3, None, "base_leans"),
-        (9.9, None, "base_leans"),
         (10.1, "gravity_tilted", "gravity_off_mounting"),
-        (59.9, "gravity_tilted", "gravity_off_mounting"),
         (60.1, "mounting_undeclared", "gravity_off_mounting"),
-        (134.9, "mounting_undeclared", "gravity_off_mounting"),
         (135.1, "weight_upwards", "weight_upwards"),
     ],
 )
@@ -145,14 +137,10 @@ def test_gravity_off_the_mounting_is_named_by_its_angle(
 @pytest.mark.parametrize(
     ("inside_m", "aside_m", "sigma_m", "reversed_torques"),
     [
-        (-0.3, 0.0, 1e-6, False),
         (0.009, 0.005, 1e-6, False),
         (0.011, 0.005, 1e-6, True),
-        (0.029, 0.02, 0.01, False),
-        (0.031, 0.02, 0.01, True),
         (0.1, 0.099, 1e-6, True),
         (0.1, 0.101, 1e-6, False),
-        (0.49, 0.2, 1e-6, True),
         (0.51, 0.2, 1e-6, False),
     ],
 )
@@ -181,11 +169,8 @@ def test_a_centre_of_mass_behind_the_sensor_but_not_beside_it_shows_reversed_tor
     [
         (0.29, 0.2, 0.0, None),
         (0.31, 0.2, 0.0, "tool_mass_mismatch"),
-        (1.29, 1.0, 0.0, None),
-        (1.31, 1.0, 0.0, "tool_mass_mismatch"),
         (1.79, 1.0, 0.2, None),
         (1.81, 1.0, 0.2, "tool_mass_mismatch"),
-        (1.4, 10.0, 0.0, "tool_mass_mismatch"),
         (0.07, 1.0, 0.0, "weight_compensated"),  # a remainder
         (0.14, 1.0, 0.0, "tool_mass_mismatch"),
     ],
@@ -210,8 +195,6 @@ def test_a_mass_is_compared_with_that_of_the_tool(
 @pytest.mark.parametrize(
     "setup",
     [
-        Setup(),
-        Setup(**TOOL),
         Setup(**TOOL | {"sensor_height_m": None}),
         Setup(tool_mass_kg=1.4, payload_kg=1.7),
         Setup(tool_mass_kg=1.25 * LOAD_KG),
@@ -226,7 +209,6 @@ def test_a_result_that_agrees_with_the_cell_is_good(setup: Setup) -> None:
     [
         ((0.0, 0.07, 0.08), 0.04, 30),  # beyond the tip
         ((0.0, 0.07, 0.08), None, 0),  # the sensor may be at the flange face
-        ((0.0, 0.04, 0.08), None, 20),
         ((0.0, 0.16, 0.08, 0.072, -0.005), 0.04, 20),  # beside it
         ((0.12, 0.16, 0.08), 0.04, 20),  # below it
         ((0.0, 0.095, 0.08), 0.04, 0),  # within the margin
@@ -264,21 +246,17 @@ def test_reversed_torques_come_before_what_they_put_outside() -> None:
     assert (result.verdict, codes(result)) == ("usable", ["torques_reversed"])
 
 
-@pytest.mark.parametrize(
-    ("length_m", "code"),
-    [pytest.param(0.16, "torques_reversed", marks=pytest.mark.slow), (0.07, "torques_about_point")],
-)
-def test_torques_about_the_tcp_are_not_only_called_reversed(length_m: float, code: str) -> None:
-    """The tool is long enough for a centre of mass that reversed torques would have 90 mm from the sensor, or not."""
+def test_torques_about_the_tcp_are_not_only_called_reversed() -> None:
+    """The tool is too short for a centre of mass that reversed torques would have 90 mm from the sensor."""
     data = session()
     about_tcp = R_FLANGE_SENSOR.T @ [0.0, 0.0, 0.15]
     torque = data.wrench[:, 3:] - np.cross(about_tcp, data.wrench[:, :3])
     moved = replace(data, wrench=np.concatenate([data.wrench[:, :3], torque], axis=1))
-    result = solve(moved, setup=Setup(**TOOL | {"cylinders_m": [(0.0, length_m + 0.04, 0.08)]}))
-    assert (result.verdict, codes(result)[0]) == ("usable", code)
+    result = solve(moved, setup=Setup(**TOOL | {"cylinders_m": [(0.0, 0.11, 0.08)]}))
+    assert (result.verdict, codes(result)[0]) == ("usable", "torques_about_point")
     assert result.findings[0].values["inside_mm"] == pytest.approx(90, abs=2)
     assert "--wrench-frame tcp --tcp" in result.findings[0].fix
-    assert ("reverse" in result.findings[0].fix) == (code == "torques_reversed")
+    assert "reverse" not in result.findings[0].fix
 
 
 @pytest.mark.parametrize(("load_kg", "found"), [(1.07, []), (0.91, ["tool_mass_mismatch"])])
@@ -301,14 +279,10 @@ def test_only_quaternions_can_have_been_read_in_another_order() -> None:
     ("payload_kg", "load_kg", "sensor_kg", "fits"),
     [
         (1.50, 0.64, None, False),  # 0.86 kg off, which no usual sensor explains
-        (1.40, 0.64, None, True),
         (1.40, 0.64, 0.1, False),
-        (0.10, 0.64, None, False),
         (0.20, 0.64, None, True),  # smaller by the limit: a sensor cannot weigh less than nothing
-        (0.20, 0.64, 0.1, False),
         (6.4, 5.0, 0.1, True),  # 30 %
         (6.7, 5.0, 0.1, False),
-        (0.0, 1.5, None, False),
     ],
 )
 def test_a_payload_is_compared_with_all_that_hangs_on_the_flange(
@@ -374,8 +348,7 @@ def test_a_direction_is_compared_in_sigmas_across_it(axis: int, sigma_rad: float
         assert found[0].values["sigma_deg"] == pytest.approx(np.degrees(sigma_rad), rel=1e-3)
 
 
-@pytest.mark.parametrize("yaw_only", [False, True])
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(("axis", "yaw_only"), [(2, False), (0, True), (2, True)])
 def test_a_mounting_is_compared_but_for_a_free_yaw(axis: int, yaw_only: bool) -> None:
     turn: NDArray[np.float64] = Rotation.from_rotvec(0.0082 * np.eye(3)[axis]).as_matrix()
     known = Known(R_flange_sensor=turn, yaw_only=yaw_only)
@@ -400,10 +373,8 @@ def test_without_a_significant_weight_no_direction_is_compared() -> None:
     [
         (90.0, False, [["wrench", ["-y", "x", "z"]]]),
         (90.0, True, [["wrench", ["y", "-x", "-z"]]]),  # mirrored forces read like a weight that pulls upwards
-        (95.0, False, [["wrench", ["-y", "x", "z"]]]),
         (96.5, False, []),
         (5.0, False, []),  # in the right order
-        (45.0, False, []),
     ],
 )
 def test_axes_in_another_order_are_named(turn_deg: float, upwards: bool, corrections: list[object]) -> None:

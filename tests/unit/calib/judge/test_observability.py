@@ -93,13 +93,12 @@ def test_degenerate_sets_have_their_rank_a_reason_and_advice_that_helps(name: st
     assert completed.ambiguities == completed.advice == ()
 
 
-@pytest.mark.parametrize("tilt_deg", [20, 40, 60])
-def test_one_tilt_has_full_rank_and_an_exact_second_solution(tilt_deg: float) -> None:
-    R = leaning(tilt_deg)
+def test_one_tilt_has_full_rank_and_an_exact_second_solution() -> None:
+    R = leaning(40)
     found = assess(R)
     assert found.rank == 15
     assert found.second_gap < 1e-12
-    assert f"one angle to gravity, {tilt_deg}° from the vertical" in found.ambiguities[0]
+    assert "one angle to gravity, 40° from the vertical" in found.ambiguities[0]
     assert "tilt the tool" in found.sentence()
     assert len(found.advice) == 1
     completed = assess(np.concatenate([R, found.advised_R_base_flange]))

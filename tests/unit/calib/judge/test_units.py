@@ -31,15 +31,10 @@ def test_units_are_as_large_as_defined() -> None:
     [
         (0.31, 0.1, 1.0, []),
         (0.29, 0.1, 1.0, [("weight_compensated", "limit", None)]),
-        (0.2, 0.1, 0.0061, [("weight_compensated", "limit", None)]),
-        (0.2, 0.1, 0.0059, [("weight_implausible", "limit", [["kN", "kN·m"]])]),
         (0.2, 0.019, 0.0, [("weight_compensated", "limit", None)]),
         (0.2, 0.021, 0.0, [("weight_implausible", "limit", [["kN", "kN·m"]])]),
-        (0.2, 0.19, 0.0, [("weight_implausible", "limit", [["kN", "kN·m"]])]),
-        (0.2, 0.21, 0.0, [("weight_compensated", "limit", None)]),
         (490.0, 0.1, 1.0, []),
         (510.0, 0.1, 1.0, [("weight_implausible", "limit", [["mN", "N·mm"]])]),
-        (1990.0, 0.1, 1.0, [("weight_implausible", "limit", [["mN", "N·mm"]])]),
         (2010.0, 0.1, 1.0, [("weight_implausible", "reject", [["mN", "N·mm"]])]),
         (50_000.0, 1e-3, 1.0, [("weight_implausible", "reject", [["gf", "N·m"]])]),
         (52_000.0, 1e-3, 1.0, [("weight_implausible", "reject", [["mN", "N·m"]])]),  # 510 N of gf are no tool
@@ -59,10 +54,7 @@ def test_a_weight_of_no_tool_is_named_with_the_units_that_make_it_one(
         (0.24, False, []),
         (0.26, False, [("com_too_far", "limit", 0.25)]),
         (0.26, True, []),
-        (0.49, False, [("com_too_far", "limit", 0.25)]),
-        (0.49, True, []),
         (0.51, False, [("com_too_far", "reject", 0.5)]),
-        (0.51, True, []),
         (2.0, True, []),
     ],
 )
@@ -84,9 +76,7 @@ def test_a_mass_agrees_with_another_in_the_unit_that_makes_it_so() -> None:
     [
         (10.0, 490.0, 90.0, None),
         (10.0, 510.0, 0.0, "limit"),
-        (10.0, 0.0, 110.0, "limit"),
         (30.0, 510.0, 110.0, None),  # a large sensor, not many weights
-        (10.0, 1990.0, 0.0, "limit"),
         (10.0, 2010.0, 0.0, "reject"),
         (10.0, 0.0, 410.0, "reject"),
         (4000.0, 25_400.0, 0.0, None),  # which the weight shows

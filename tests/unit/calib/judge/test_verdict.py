@@ -124,15 +124,14 @@ def test_a_pose_that_nothing_checks_is_named() -> None:
 # Statistics
 
 
-@pytest.mark.parametrize("runs", [25, pytest.param(80, marks=pytest.mark.slow)])
-def test_p_values_are_uniform_and_clean_runs_are_good_without_a_finding(runs: int) -> None:
-    rng = np.random.default_rng(7)
+def test_p_values_are_uniform_and_clean_runs_are_good_without_a_finding() -> None:
+    rng, runs = np.random.default_rng(7), 25
     judged = [judge(fit(R24, noisy(rng, R24), white(24))) for _ in range(runs)]
     p = np.sort([q.chi2_p for q in judged if q.chi2_p is not None])
     assert len(p) == runs
     assert np.abs(p - np.arange(1, runs + 1) / runs).max() < 1.6 / np.sqrt(runs)  # Kolmogorov's 1 %
     assert all(q.verdict == "good" for q in judged)
-    assert sum(bool(q.findings) for q in judged) <= max(1, runs // 40)
+    assert sum(bool(q.findings) for q in judged) <= 1
     assert np.mean([q.lag1 for q in judged]) == pytest.approx(0, abs=0.36 / np.sqrt(runs))
 
 
@@ -207,7 +206,7 @@ def test_few_poses_and_rejected_poses_are_reported() -> None:
         assert quality.worst_pose not in bumped
 
 
-@pytest.mark.parametrize("channel", range(6))
+@pytest.mark.parametrize("channel", [2, 3])
 def test_what_is_known_is_doubted_where_the_data_fit_without_it(channel: int) -> None:
     wrench = noisy(np.random.default_rng(24), R24)
     free = fit(R24, wrench, white(24))
@@ -259,18 +258,10 @@ DISAGREE = {"orientations_inverted", "axes_disagree", "weight_upwards", "forces_
     ("reversed_channels", "code", "corrections"),
     [
         (F + T, "weight_upwards", None),
-        pytest.param(["fx", "tx"], "weight_upwards", None, marks=pytest.mark.slow),
         (F, "forces_reversed", None),
         (T, "torques_reversed", None),
         (["tx"], "axes_disagree", [["torque", ["-x", "y", "z"]]]),
-        (["fy"], "axes_disagree", [["force", ["x", "-y", "z"]]]),
         (["ty", "tz"], "axes_disagree", [["torque", ["x", "-y", "-z"]], ["force", ["x", "-y", "-z"]]]),
-        pytest.param(
-            ["fx", "fy"],
-            "axes_disagree",
-            [["torque", ["-x", "-y", "z"]], ["force", ["-x", "-y", "z"]]],
-            marks=pytest.mark.slow,
-        ),
     ],
 )
 def test_reversed_channels_are_detected(
@@ -339,7 +330,6 @@ SMOOTH = {"response_not_linear", "cable_acts", "orientations_smoothly_off"}
     [
         ({"load_force": 0.0019, "load_torque": 0.0005}, [("response_not_linear", "note")]),
         ({"load_torque": 0.0021}, [("response_not_linear", "limit")]),
-        ({"cable_force_N": 0.0019 * WEIGHT_N}, [("cable_acts", "note")]),
         ({"cable_torque_Nm": 0.0021 * WEIGHT_N * 0.1}, [("cable_acts", "limit")]),
         ({"kinematics_rad": 0.0021, "gain": 0.1}, [("orientations_smoothly_off", "limit")]),
         ({"walk_force_N": 1.0, "load_force": 0.0004}, []),
@@ -386,7 +376,7 @@ def test_a_linear_drift_goes_on_for_the_next_minute(timed: bool) -> None:
 def test_the_likely_error_is_that_of_the_next_use_where_the_bias_walks() -> None:
     walk, rng, ratios = np.repeat([0.1, 0.003], 3), np.random.default_rng(27), []
     times = 10.0 * np.arange(24, dtype=np.float64)
-    for _ in range(7):
+    for _ in range(4):
         moved = np.cumsum(rng.normal(size=(30, 6)) * walk, axis=0)  # six more in the minute after
         wrench = noisy(rng, R24) + moved[:24]
         result = solve(CalibrationDataset(R24, wrench, white(24), np.full(24, 500), times))
@@ -405,14 +395,7 @@ def test_a_real_session_read_with_wrong_signs_is_found_out(real_data: Path) -> N
     assert corrections == [["torque", ["-x", "y", "z"]]]
 
 
-@pytest.mark.parametrize(
-    ("sigma", "digits"),
-    [
-        (None, 6),
-        (0.01, 15),
-        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((None, 15), (1e-9, 15), (0.01, 6))),
-    ],
-)
+@pytest.mark.parametrize(("sigma", "digits"), [(None, 6), (0.01, 15)])
 def test_findings_are_not_made_of_rounding(sigma: float | None, digits: int) -> None:
     cov = None if sigma is None else np.eye(6) * sigma**2
     textbook = Parameters(np.eye(3), np.array([0.0, 0, -10]), np.zeros(3), np.array([0, 0, 0.05]), np.zeros(3))

@@ -111,9 +111,7 @@ def test_statistics_give_the_normal_equations_of_the_data() -> None:
 # Efficiency and basins
 
 
-@pytest.mark.parametrize(
-    ("n", "degrees", "weight_in_sigma"), [(6, 180, 10), (12, 40, 30), pytest.param(24, 20, 30, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("n", "degrees", "weight_in_sigma"), [(6, 180, 10), (12, 40, 30)])
 def test_no_start_reaches_a_lower_minimum(n: int, degrees: float, weight_in_sigma: float) -> None:
     sigma = SIGMA * 100 / weight_in_sigma
     for seed in range(4):
@@ -132,7 +130,7 @@ def test_no_start_reaches_a_lower_minimum(n: int, degrees: float, weight_in_sigm
 def test_the_odds_of_the_second_basin_are_those_of_being_wrong() -> None:
     azimuth = np.arange(8) * np.pi / 4
     expected, wrong, seen = 0.0, 0, 0
-    for seed in range(120):
+    for seed in range(60):
         rng = np.random.default_rng(seed)
         lean = np.deg2rad(40) * np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
         lean[0] *= rng.uniform(0.4, 1)  # all but one of the same tilt: up and down look alike
@@ -143,23 +141,21 @@ def test_the_odds_of_the_second_basin_are_those_of_being_wrong() -> None:
             seen += 1
             expected += 1 / (1 + np.exp(best.second_basin_chi2 / 2))
             wrong += bool(np.linalg.norm(best.parameters.difference(p)[:3]) > np.pi / 2)
-    assert seen > 20
+    assert seen > 10
     assert abs(wrong - expected) < 3 * np.sqrt(expected)
 
 
 # What is not sensor noise
 
 
-@pytest.mark.parametrize(("n", "bumped"), [pytest.param(24, 6, marks=pytest.mark.slow), (12, 3)])
-@pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_bumped_poses_are_rejected_and_no_others(n: int, bumped: int, measured: bool) -> None:
-    rng = np.random.default_rng(0)
+def test_bumped_poses_are_rejected_and_no_others() -> None:
+    rng, n, bumped = np.random.default_rng(0), 12, 3
     p, R = truth(rng), haar(rng, n)
     push = rng.normal(size=(bumped, 3))
     push *= (WEIGHT_N * rng.uniform(0.2, 1, bumped) / np.linalg.norm(push, axis=1))[:, None]
     wrench = predict(p, R) + noise(rng, n)
     wrench[:bumped] += np.concatenate([push, np.cross(0.1 * rng.normal(size=(bumped, 3)), push)], axis=1)
-    best = fit(R, wrench, WHITE if measured else None)
+    best = fit(R, wrench, WHITE)
     assert np.flatnonzero(best.weights == 0).tolist() == list(range(bumped))
     assert best.dof == 6 * (n - bumped) - 15
     distances = squared_length(best.left_out_residuals, best.left_out_cov)
@@ -181,7 +177,7 @@ def test_seven_poses_are_never_split_into_right_and_wrong() -> None:
 def test_inexact_orientations_are_found_and_weighed() -> None:
     sigma, turn = SIGMA / 10, np.deg2rad(0.3)
     error, least, found = np.zeros(5), np.zeros(5), []
-    for seed in range(20):
+    for seed in range(10):
         rng = np.random.default_rng(seed)
         p, R = truth(rng), haar(rng, 24)
         wrench = predict(p, R) + noise(rng, 24, sigma)
@@ -207,7 +203,7 @@ def drifting(rng: np.random.Generator, n: int, kind: str) -> tuple[Parameters, A
 
 def test_a_drifting_bias_is_followed() -> None:
     turned, covered, changes = [], [], []
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         p, R, wrench, bias = drifting(rng, 60, "walk")
         best = fit(R, wrench, np.diag((SIGMA / 10) ** 2))
@@ -235,7 +231,7 @@ def test_a_linear_drift_is_named_and_measured() -> None:
     assert best.dof == 6 * 24 - 15 - 6
 
 
-@pytest.mark.parametrize("drift", DRIFTS[1:])
+@pytest.mark.parametrize("drift", DRIFTS[1:3])
 def test_left_out_poses_are_predicted_as_by_a_new_fit(drift: Drift) -> None:
     rng = np.random.default_rng(6)
     _, R, wrench, _ = drifting(rng, 11, "walk")
@@ -355,9 +351,8 @@ def test_impossible_knowledge_is_refused(fields: dict[str, object], words: str) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("samples", "spread"), [(10, 0.5), (200, 0.5)])
-def test_covariances_from_few_samples_do_no_harm(samples: int, spread: float) -> None:
-    n = 24
+def test_covariances_from_few_samples_do_no_harm() -> None:
+    n, samples, spread = 24, 10, 0.5
     error, least, direct = np.zeros(5), np.zeros(5), np.zeros(5)
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -374,8 +369,7 @@ def test_covariances_from_few_samples_do_no_harm(samples: int, spread: float) ->
     # One of the eight sets seems to drift: its biases are those of the last pose.
     assert (error / least < [1.7, 1.7, 2.5, 1.7, 2.5]).all()
     assert np.mean((error / least)[[0, 1, 3]]) < 1.35
-    if samples == 10:
-        assert np.mean(direct / least) > 1.3
+    assert np.mean(direct / least) > 1.3
 
 
 def test_many_poses_are_predicted_in_parts_as_they_would_be_at_once() -> None:
@@ -392,7 +386,7 @@ def test_many_poses_are_predicted_in_parts_as_they_would_be_at_once() -> None:
     np.testing.assert_allclose(best.left_out_cov, others @ WHITE, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 6, 7])
+@pytest.mark.parametrize("n", [1, 6])
 def test_the_blocks_of_the_inverse_are_those_of_the_dense_one(n: int) -> None:
     rng = np.random.default_rng(n)
     diagonal, above = rng.normal(size=(n, 3, 3)), rng.normal(size=(n - 1, 3, 3))

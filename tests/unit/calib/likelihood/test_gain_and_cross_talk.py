@@ -56,13 +56,12 @@ def test_columns_are_the_derivative_of_the_response() -> None:
     np.testing.assert_allclose(response_columns(p, R) @ x, read(p, R, M, L) - predict(p, R), atol=1e-12)
 
 
-@pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_a_sensor_of_wrong_gain_is_predicted_as_well_as_by_an_oracle(measured: bool) -> None:
+def test_a_sensor_of_wrong_gain_is_predicted_as_well_as_by_an_oracle() -> None:
     ours, plain = [], []
     for seed in range(4):
         rng = np.random.default_rng(seed)
         p, R, wrench, M, L = session(rng, 24, 0.02, 0.02)
-        best = fit(R, wrench, WHITE if measured else None)
+        best = fit(R, wrench, WHITE)
         assert best.response is not None
         elsewhere = Rotation.random(50, rng=rng).as_matrix()
         right = read(p, elsewhere, M, L)
@@ -77,15 +76,15 @@ def test_a_sensor_of_wrong_gain_is_predicted_as_well_as_by_an_oracle(measured: b
 @pytest.mark.slow
 def test_nothing_is_found_in_a_sensor_without_error() -> None:
     found = 0
-    for seed in range(40):
+    for seed in range(20):
         _, R, wrench, _, _ = session(np.random.default_rng(seed), 24, 0.0, 0.0)
         found += fit(R, wrench, WHITE).response is not None
-    assert found <= 2
+    assert found <= 1
 
 
 def test_few_poses_do_not_show_it_and_it_counts_as_that_of_usual_sensors() -> None:
     distances = []
-    for seed in range(40):
+    for seed in range(10):
         rng = np.random.default_rng(seed)
         p, R, wrench, M, L = session(rng, 6, 0.02, 0.01)
         best = fit(R, wrench, WHITE)
@@ -116,7 +115,7 @@ def test_compensation_applies_it_unless_asked_not_to() -> None:
 
 @pytest.mark.slow
 def test_sigmas_of_the_tool_include_what_gain_and_cross_talk_hide() -> None:
-    seeds = 16
+    seeds = 8
     z, compensation = [], []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)

@@ -110,19 +110,15 @@ def test_minima_scale_with_units(seed: int, weight: float, unit: float) -> None:
     assert max(nearest(found, m.R) for m in scaled) < 1e-6
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_brute_force_finds_no_other_minimum(seed: int) -> None:
-    Q = wishart(seed)
-    if seed % 2:
-        R_base_flange, force, _ = problem(seed, 6, noise_N=10)
-        Q = rotation_minima.force_cost(R_base_flange, force, np.ones(6))
+def test_brute_force_finds_no_other_minimum() -> None:
+    Q = wishart(0)
     found = rotation_minima.minima(Q)
     yaw, pitch, roll = np.meshgrid(np.arange(0, 360, 12), np.arange(-90, 91, 12), np.arange(0, 360, 12))
     grid = Rotation.from_euler("ZYX", np.stack((yaw.ravel(), pitch.ravel(), roll.ravel()), axis=1), degrees=True)
     r = grid.as_matrix().reshape(-1, 9)
     costs = np.sum((r @ Q) * r, axis=1)
     assert costs.min() >= found[0].cost
-    for i in (*np.argsort(costs)[:3], *np.random.default_rng(seed).integers(0, len(r), 5)):
+    for i in (*np.argsort(costs)[:3], *np.random.default_rng(0).integers(0, len(r), 5)):
 
         def polished(v: Array, start: Rotation = grid[int(i)]) -> float:
             return cost(Q, (start * Rotation.from_rotvec(v)).as_matrix())

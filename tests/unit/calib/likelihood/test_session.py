@@ -71,10 +71,7 @@ def test_data_are_exact_to_what_a_sensor_resolves_and_to_rounding(
     assert is_exact(1e-10 * np.abs(predict(TOOL, R24)[:, group]).max(), measured=True) == exact
 
 
-@pytest.mark.parametrize(
-    "order",
-    [np.arange(24), np.arange(24)[::-1], np.r_[0, 23:0:-1], np.r_[23, 0:23], np.random.default_rng(0).permutation(24)],
-)
+@pytest.mark.parametrize("order", [np.arange(24), np.random.default_rng(0).permutation(24)])
 def test_poses_are_taken_in_the_order_of_time(order: NDArray[np.intp]) -> None:
     t_s = np.arange(24.0)[order] * 3 + 100
     cov = np.eye(6) * (1 + order)[:, None, None]

@@ -51,7 +51,7 @@ def test_what_cable_and_arm_do_in_the_middle_is_part_of_bias_and_mounting() -> N
 @pytest.mark.parametrize("kind", ["load", "cable"])
 def test_sigmas_hold_where_an_error_has_a_structure(kind: str) -> None:
     squares = []
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng([seed, 5])
         columns = structure_columns(TOOL, R24, R24.mean(axis=0))[kind]
         size = 0.005 if kind == "load" else np.repeat([0.08, 0.02], 3)[:, None]

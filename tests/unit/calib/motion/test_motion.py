@@ -116,23 +116,10 @@ def test_contact_is_left_out_and_listed() -> None:
     assert "contacts_left_out" in {one.code for one in result.findings}
 
 
-def compensated(swept: Recorded) -> Recorded:
-    weight = np.einsum("nji,j->ni", swept.R_base_flange @ TRUTH.R_flange_sensor, TRUTH.mass_kg * TRUTH.gravity_m_s2)
-    return replace(swept, wrench=swept.wrench - np.hstack([weight, np.cross(TRUTH.p_sensor_com_m, weight)]))
-
-
-def other_poses(swept: Recorded) -> Recorded:
-    other = record(TRUTH, sweep(SWEEP_S, hz=(0.17, 0.11, 0.27), phase=(2.0, 0.3, 4.0)), SWEEP_S, 1)
-    return replace(swept, R_base_flange=other.R_base_flange, p_base_flange_m=other.p_base_flange_m)
-
-
 @pytest.mark.parametrize(
     ("change", "code"),
     [
         (lambda s: replace(s, t_pose_s=s.t_pose_s + 0.5), "clock_offset"),
-        pytest.param(compensated, "wrench_compensated", marks=pytest.mark.slow),
-        pytest.param(other_poses, "other_recording", marks=pytest.mark.slow),
-        (lambda s: replace(s, wrench=s.wrench * [1, -1, 1, -1, 1, -1]), "reversed_in_motion"),
         (lambda _: record(TRUTH, sweep(SWEEP_S, (0.17, 0.17, 0.17)), SWEEP_S, 1), "motion_narrow"),
     ],
 )
@@ -142,18 +129,17 @@ def test_wrong_data_are_named(swept: Recorded, change: object, code: str) -> Non
     assert found.verdict != "good"
 
 
-@pytest.mark.parametrize("ratio", [1.02, 2.0])
-def test_another_rate_of_one_clock_is_named_and_undone(swept: Recorded, ratio: float) -> None:
+def test_another_rate_of_one_clock_is_named_and_undone(swept: Recorded) -> None:
+    ratio = 1.02
     found = solve_motion(*means_of(replace(swept, t_s=3.0 + ratio * swept.t_s)))
     assert found.findings[0].code == "clocks_differ"
     assert found.findings[0].values["ratio"] == pytest.approx(ratio, rel=2e-3)
     assert not {"clock_offset", "clock_rate"} & {one.code for one in found.findings}
 
 
-@pytest.mark.parametrize("jitter_s", [0.0, 0.04])
-def test_of_ten_poses_a_second_the_rests_count(jitter_s: float) -> None:
+def test_of_ten_poses_a_second_the_rests_count() -> None:
     """Fast moves between rests; the times of both streams are off by up to the jitter."""
-    rng = np.random.default_rng(5)
+    rng, jitter_s = np.random.default_rng(5), 0.04
     postures = HOME + rng.uniform(-1, 1, (12, 6)) * [0.4, 0.2, 0.2, 1.0, 1.0, 1.3]
 
     def joints(t: Array) -> Array:

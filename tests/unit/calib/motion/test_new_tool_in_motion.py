@@ -59,22 +59,7 @@ def test_gain_and_cross_talk_are_kept() -> None:
     assert np.abs((found.force_gain - gain) / found.sigma["force_gain"]).max() < 4
 
 
-@pytest.mark.parametrize(
-    ("changed", "named"),
-    [
-        pytest.param(
-            {"mounting_rotvec": OLD.mounting_rotvec * (1 + np.radians(1.0) / 0.8)},
-            r"the mounting of the sensor has changed, by (1|0\.9\d)°",
-            marks=pytest.mark.slow,
-            id="mounting",
-        ),
-        pytest.param(
-            {"gravity_m_s2": Rotation.from_rotvec([2, 0, 0], degrees=True).apply(OLD.gravity_m_s2)},
-            "the base has tilted, by 2°",
-            id="base",
-        ),
-    ],
-)
-def test_what_holds_no_more_is_named(changed: dict[str, Any], named: str, earlier: CalibrationResult) -> None:
-    with pytest.raises(NotObservable, match=named):
-        swept(replace(NEW, **changed), earlier)
+def test_what_holds_no_more_is_named(earlier: CalibrationResult) -> None:
+    gravity_m_s2 = Rotation.from_rotvec([2, 0, 0], degrees=True).apply(OLD.gravity_m_s2)
+    with pytest.raises(NotObservable, match="the base has tilted, by 2°"):
+        swept(replace(NEW, gravity_m_s2=gravity_m_s2), earlier)

@@ -95,7 +95,7 @@ def test_prediction_is_what_the_solver_states_for_such_data() -> None:
 
 
 @pytest.mark.parametrize("numbers", [range(1, 25), T12])
-@pytest.mark.parametrize("kappa", [0.0, 1.0, 10.24, 100.0])
+@pytest.mark.parametrize("kappa", [0.0, 10.24])
 def test_balanced_sets_have_the_closed_form_bound(numbers: tuple[int, ...], kappa: float) -> None:
     n, weight_N, sigma_N, lever_m = len(numbers), 20.0, 0.2, 0.025
     com = np.array([0, 0, lever_m * np.sqrt(kappa)])
@@ -132,10 +132,7 @@ def test_published_table_of_fixed_sets(numbers: tuple[int, ...], figures: list[f
     ("degrees", "figures"),
     [
         pytest.param(120, [1.23, 1.7, 0.126, 0.084, 0.0102, 0.0177, 0.13], marks=pytest.mark.slow),
-        pytest.param(90, [1.55, 2.6, 0.131, 0.084, 0.0104, 0.0183, 0.14], marks=pytest.mark.slow),
-        pytest.param(60, [2.8, 6.3, 0.167, 0.087, 0.0131, 0.0250, 0.17], marks=pytest.mark.slow),
         (45, [4.1, 11, 0.220, 0.093, 0.0177, 0.0347, 0.22]),
-        pytest.param(30, [6.3, 24, 0.325, 0.105, 0.0285, 0.0535, 0.32], marks=pytest.mark.slow),
         pytest.param(15, [13, 82, 0.64, 0.11, 0.060, 0.109, 0.62], marks=pytest.mark.slow),
     ],
 )
@@ -241,9 +238,8 @@ def test_impossible_choices_are_rejected() -> None:
 # ---- one after the other
 
 
-@pytest.mark.parametrize("half_angle_deg", [40, *(pytest.param(one, marks=pytest.mark.slow) for one in (180, 20))])
-def test_next_poses_improve_the_prediction_and_open_the_gap(half_angle_deg: int) -> None:
-    candidates = cone_candidates(np.deg2rad(half_angle_deg), spins=6, directions=40)
+def test_next_poses_improve_the_prediction_and_open_the_gap() -> None:
+    candidates = cone_candidates(np.deg2rad(40), spins=6, directions=40)
     R = np.zeros((0, 3, 3))
     sigmas, gaps = [], []
     for _ in range(12):
@@ -255,7 +251,7 @@ def test_next_poses_improve_the_prediction_and_open_the_gap(half_angle_deg: int)
         gaps.append(prediction.second_basin_gap)
     assert np.isinf(sigmas[1]).all()
     assert (np.diff(sigmas[3:], axis=0) < 0).all()
-    assert max(gaps[5:]) > {180: 0.5, 40: 0.02, 20: 0.001}[half_angle_deg]
+    assert max(gaps[5:]) > 0.02
 
 
 def test_next_pose_is_the_best_by_brute_force() -> None:

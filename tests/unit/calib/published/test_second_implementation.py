@@ -18,7 +18,6 @@ from ftcalib.published.yu import special_numbers
 from tests import second_methods as second
 
 SNR = 100
-SEEDS = range(4)
 SPECIAL = np.swapaxes(second.special(), 1, 2)
 
 Second = Callable[[Parameters, Array, Array, Array], second.Estimate]
@@ -109,7 +108,7 @@ def test_every_published_method_is_compared() -> None:
     assert sorted(METHODS) == sorted(PUBLISHED)
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in SEEDS[2:])])
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(("method", "as_published"), CASES)
 def test_both_find_the_same_estimate_with_noise(method: str, as_published: bool, seed: int) -> None:
     ignored = as_published and seed % 2  # a bias that the printed form ignores, in 40 deg, keeps algorithm 1 turning

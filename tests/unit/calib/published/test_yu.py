@@ -40,9 +40,7 @@ def test_every_sum_leaves_one_entry_of_the_orientations() -> None:
                 np.testing.assert_array_equal(SPECIAL_R_flange_base[np.array(numbers) - 1].sum(axis=0), entry)
 
 
-@pytest.mark.parametrize(
-    "Y", [turned("z", 45), turned("z", -45), turned("z", 20), turned("x", 170), turned("ZYX", [10, 20, 30])]
-)
+@pytest.mark.parametrize("Y", [np.eye(3), turned("z", 45), turned("ZYX", [10, 20, 30])])
 def test_srom_works_when_all_orientations_are_turned_by_a_common_rotation(Y: Array) -> None:
     rng = np.random.default_rng(1)
     order = rng.permutation(24)
@@ -70,10 +68,9 @@ def is_numbered(R: Array, number: NDArray[np.intp], Y: Array, expected: NDArray[
     return bool(fits) and ((number >= 0) == special).all()
 
 
-@pytest.mark.parametrize("turns", [20, pytest.param(300, marks=pytest.mark.slow)])
-def test_deviations_up_to_1_degree_are_recognised_for_any_turn_of_the_base(turns: int) -> None:
+def test_deviations_up_to_1_degree_are_recognised_for_any_turn_of_the_base() -> None:
     rng = np.random.default_rng(3)
-    for Y in Rotation.random(turns, rng=rng).as_matrix():
+    for Y in Rotation.random(20, rng=rng).as_matrix():
         order = rng.permutation(24)
         R = (deviating(rng, 24, 1.0) @ Y @ R24)[order]
         number, found = special_numbers(R)
@@ -157,7 +154,7 @@ def test_srom_gravity_force_has_the_sign_of_every_component() -> None:
         np.testing.assert_allclose(srom_gravity_force(force_N), F_b, atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [5, 7, 100])
+@pytest.mark.parametrize("n", [5, 7])
 def test_lrom_is_exact_from_five_poses_whatever_the_mounting(n: int) -> None:
     rng = np.random.default_rng(n)
     for _ in range(20):
