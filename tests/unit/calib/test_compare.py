@@ -69,15 +69,6 @@ def test_errors_of_weight_and_centre_are_shares_of_the_truth() -> None:
     assert one.centre_error == pytest.approx(0.5 / 1.5)
 
 
-def test_the_truth_is_by_default_what_all_poses_but_those_of_d_give() -> None:
-    poses = measured(0.2)
-    used = NUMBERS // 1000 != 3
-    likeliest = solve(CalibrationDataset.of(POSES[used], poses.wrench[used], t_s=poses.t_s[used]))
-    given, default = (table_iii(poses, NUMBERS.tolist(), truth) for truth in (likeliest.parameters, None))
-    assert [one.mass_error for *_, one in default] == pytest.approx([one.mass_error for *_, one in given])
-    assert [one.centre_error for *_, one in default] == pytest.approx([one.centre_error for *_, one in given])
-
-
 @pytest.mark.parametrize(
     ("name", "cases"),
     [

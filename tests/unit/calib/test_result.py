@@ -81,22 +81,6 @@ def test_predicted_error_is_the_mean_over_all_orientations() -> None:
     assert torque_Nm == pytest.approx(np.sqrt(np.trace(cov[3:, 3:])), rel=1e-9)
 
 
-def test_wrench_covariance_predicts_the_spread_of_predictions() -> None:
-    rng = np.random.default_rng(4)
-    steps = rng.multivariate_normal(np.zeros(15), RESULT.covariance, 4000)
-    spread = np.cov([predict(RESULT.parameters.moved(step), R[0]) for step in steps], rowvar=False)
-    stated = RESULT.wrench_covariance(R[0])
-    np.testing.assert_allclose(np.diag(spread), np.diag(stated), rtol=0.1)
-    np.testing.assert_allclose(RESULT.wrench_covariance(R)[0], stated)
-
-
-def test_compensate_leaves_the_contact() -> None:
-    contact = RNG.normal(size=(10, 6))
-    wrench = predict(RESULT.parameters, R) + contact
-    np.testing.assert_allclose(RESULT.compensate(wrench, R), contact, atol=1e-12)
-    np.testing.assert_allclose(RESULT.compensate(wrench[3], R[3]), contact[3], atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("wrench", "rotation"), [((6,), (10, 3, 3)), ((10, 6), (3, 3)), ((10, 5), (10, 3, 3)), ((), ())]
 )

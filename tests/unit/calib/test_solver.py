@@ -133,19 +133,6 @@ def test_the_covariance_is_honest(orientations: str, seed: int, runs: int) -> No
     assert (np.abs(stated.reshape(5, 3).sum(axis=1) / bound - 1) < widened).all()
 
 
-def test_sigmas_of_the_closed_forms_are_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.undo()
-    rng = np.random.default_rng(3)
-    cov = white(24, 4 * SIGMA)
-    stated = np.diag(solve(dataset(R24, noisy(rng, R24, cov), cov), "srom").covariance)
-    estimate = published("srom", R24, gravity_direction_base=-UP_IN_BASE)
-    squared = np.mean([estimate(noisy(rng, R24, cov)).difference(TRUTH) ** 2 for _ in range(100)], axis=0)
-    ratio = squared.reshape(5, 3).sum(axis=1) / stated.reshape(5, 3).sum(axis=1)
-    np.testing.assert_allclose(ratio, 1, atol=0.3)
-    best = np.diag(solve(dataset(R24, noisy(rng, R24, cov), cov)).covariance)
-    assert stated[:3].sum() > 2 * best[:3].sum()  # torques add information about the rotation
-
-
 def test_a_closed_form_takes_its_residuals_as_the_noise_that_was_not_measured() -> None:
     wrench = noisy(np.random.default_rng(6), R24, white(24))
     result = solve(dataset(R24, wrench), "srom")
@@ -246,7 +233,7 @@ def given(method: Method) -> Known | None:
 
 
 @pytest.mark.parametrize("sigma_N", [None, 1e-5])
-@pytest.mark.parametrize(("method", "as_published"), [*product(PUBLISHED, [False]), *product(CARLSON, [True])])
+@pytest.mark.parametrize(("method", "as_published"), [*product(PUBLISHED, [False]), (CARLSON[0], True)])
 def test_published_methods_are_good_without_noise(method: Method, as_published: bool, sigma_N: float | None) -> None:
     R, truth = R24 if method == "srom" else R48, NO_BIAS if as_published else LEVEL
     cov = None if sigma_N is None else white(len(R), sigma_N * SIGMA / SIGMA[0])
@@ -388,11 +375,6 @@ def test_unknown_methods_and_gravity_are_rejected() -> None:
 def verdict_of(wrench: Array, R: Array = R24, cov: Array | None = None) -> tuple[str, dict[str, Finding]]:
     result = solve(dataset(R, wrench, cov))
     return result.verdict, {one.code: one for one in result.findings}
-
-
-def test_a_clean_run_is_good_without_a_finding() -> None:
-    rng = np.random.default_rng(8)
-    assert verdict_of(noisy(rng, R24, white(24)), cov=white(24)) == ("good", {})
 
 
 def test_nothing_on_the_sensor_is_never_a_calibration() -> None:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Parameters, Setup, solve
 from ftcalib.findings import Finding
-from ftcalib.judge.described_cell import _OTHER_ORDERS, LEAN_DEG, contradictions, directions, lean_from, payload, tool
+from ftcalib.judge.described_cell import _OTHER_ORDERS, contradictions, directions, lean_from, payload, tool
 from ftcalib.model import STANDARD_GRAVITY_M_S2, predict
 from ftcalib.poses.information import special
 
@@ -78,20 +78,6 @@ def test_the_low_side_is_named(up: tuple[float, ...], heading_deg: float) -> Non
     # A point on that side has sunk from where a true mounting would have it, nearly as far as any point could.
     sunk = (R_world_mounted @ side - R_world_base @ side)[2] / np.linalg.norm(side)
     assert sunk > np.cos(np.radians(31)) * np.sin(np.radians(0.8))
-
-
-@pytest.mark.parametrize(
-    ("angle_deg", "sigma_N", "significant"),
-    [
-        (0.9 * LEAN_DEG, 0.001, False),
-        (1.1 * LEAN_DEG, 0.001, True),
-        (1, 12 * np.radians(1) / 3.9, False),
-        (1, 12 * np.radians(1) / 4.1, True),
-    ],
-)
-def test_a_base_that_is_level_or_may_be_does_not_lean(angle_deg: float, sigma_N: float, significant: bool) -> None:
-    gravity_N = 12 * np.array([np.sin(np.radians(angle_deg)), 0, -np.cos(np.radians(angle_deg))])
-    assert lean_from(np.array([0.0, 0, -1]), gravity_N, np.eye(3) * sigma_N**2).is_significant == significant
 
 
 @pytest.mark.parametrize(("shift", "order"), [(1, "w, x, y, z"), (-1, "x, y, z, w")])

@@ -152,8 +152,8 @@ def test_three_orientations_are_never_enough_although_their_rank_is_full() -> No
 
 @pytest.mark.parametrize(
     "R",
-    [ANY[:3], np.tile(ANY[:1], (9, 1, 1)), turned("z", tilt_deg=150), leaning(40), about_the_vertical()],
-    ids=["few", "one orientation", "last joint", "one tilt", "about the vertical"],
+    [ANY[:3], leaning(40), about_the_vertical()],
+    ids=["few", "one tilt", "about the vertical"],
 )
 def test_rejections_are_one_sentence_with_advice(R: Array, snapshot: SnapshotAssertion) -> None:
     with pytest.raises(NotObservable) as refusal:

@@ -63,7 +63,8 @@ def test_a_wrong_declaration_is_named_first(code: str, row: int, changed: dict[s
 
 def test_exchanged_places_are_named() -> None:
     sensor = LoadedSensor(10)
-    runs = sensor.runs(PROTOCOLS["hung, side and tip"])
+    few = [replace(one, poses=n) for one, n in zip(PROTOCOLS["hung, side and tip"], (10, 6, 6), strict=True)]
+    runs = sensor.runs(few)
     runs = with_load(with_load(runs, 1, p_flange_m=tuple(TIP_M)), 2, p_flange_m=tuple(SIDE_M))
     assert [one.code for one in solved(sensor, runs).findings] == ["loads_swapped"]
 

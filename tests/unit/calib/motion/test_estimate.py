@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from ftcalib.known import RANGE_LEVER_M
@@ -31,7 +30,7 @@ from ftcalib.motion.model import (
     motion_jacobian,
     wrench_of,
 )
-from ftcalib.motion.problem import DELAY_S, GYRATION_M, HEIGHT_M, SLOW_S, Problem
+from ftcalib.motion.problem import DELAY_S, GYRATION_M, HEIGHT_M, Problem
 from ftcalib.motion.samples import Motion, MotionRows
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import Truth, means_of, record, sweep
@@ -216,25 +215,6 @@ def test_a_smooth_error_of_the_poses_is_part_of_sigma() -> None:
     errors, ratios, _ = zip(*(smoothly_wrong(seed) for seed in range(1, 4)), strict=True)
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(ratios), axis=0)), 1, atol=0.3)
     assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.4
-
-
-def noisy_for_seconds(seed: int) -> tuple[Array, float]:
-    """Errors over sigma of the bias, and size of the noise of seconds beside .1 N."""
-    rows = rows_of(200, load_of(Truth()), seed=seed, turn_rad=0.9, sigma=SIGMA / 4)
-    keeps = float(np.exp(-ROW_S / SLOW_S))
-    white = np.random.default_rng([seed, 3]).normal(size=(700, 6))
-    course = lfilter([np.sqrt(1 - keeps**2)], [1, -keeps], white, axis=0)[500:]
-    found = fit_motion(replace(rows, wrench=rows.wrench + SIGMA / 2 * course), None, G)
-    bias = [6, 7, 8, 12, 13, 14]
-    error = load_of(Truth()).static.difference(found.load.static)[bias]
-    return error / np.sqrt(np.diag(found.covariance))[bias], found.components["slow_N"]
-
-
-@pytest.mark.slow
-def test_sigma_of_the_bias_is_right_beside_noise_of_seconds() -> None:
-    errors = np.array([noisy_for_seconds(seed)[0] for seed in range(1, 5)])
-    # 25 s are five time constants, and ten times the expected size: sigma is up to twice too small.
-    assert 0.7 < np.sqrt(np.mean(errors**2)) < 2.2
 
 
 def test_sums_of_many_rows_are_those_of_their_parts(posed: Posed) -> None:

@@ -36,15 +36,6 @@ def shifted(rows: MotionRows, by: int) -> MotionRows:
     return replace(rows, wrench=np.roll(rows.wrench, by, axis=0))
 
 
-@pytest.mark.parametrize("by", [-3, 12])
-def test_a_delay_is_found_in_whole_rows_beside_gaps_and_contact(by: int) -> None:
-    rows = replace(shifted(rows_of(150, TRUTH), by), delay_s=0.5)
-    rows.wrench[60:68] += 10.0
-    kept = np.ones(150, np.bool_)
-    kept[[20, 21, 22, 100]] = False
-    assert _coarse_delay(rows[kept])[0] == pytest.approx(0.5 + by * ROW_S)
-
-
 def test_a_delay_that_explains_little_more_is_none() -> None:
     rows = shifted(rows_of(150, TRUTH), 20)  # farther than is looked for
     assert _coarse_delay(rows)[0] == 0.0

@@ -169,21 +169,13 @@ def test_a_guess_of_nothing_is_rejected(name: str) -> None:
     ("R_base_flange", "gap", "atol"),
     [
         (ALL, 8 / 9, 1e-6),
-        (special(T12), 8 / 9, 1e-6),
         (special(SUBSET_8), 0.50, 1e-6),
         (special(SUBSET_6), 0.28, 0.005),
         (special(AMBIGUOUS_6), 0.0, 1e-9),
-        (ALL[:3], 0.0, 1e-9),
-        (np.array([tilted(40, 45 * k, 37 * k) for k in range(8)]), 0.0, 1e-9),
-        # The published 0.024 and 0.049 are for the best spins; these are nearly so.
+        # The published 0.024 is for the best spins; these are nearly so.
         (np.array([tilted(40, 360 / 7 * k, 90 * k) for k in range(7)] + [tilted(0, 0, 0)]), 0.024, 0.001),
-        (
-            np.array([tilted(40, 72 * k, 90 * k) for k in range(5)] + [tilted(0, 0, 40 * k) for k in range(3)]),
-            0.049,
-            0.002,
-        ),
     ],
-    ids=["all", "T12", "8", "6", "ambiguous 6", "3 poses", "rim", "7 and centre", "5 and 3 centre"],
+    ids=["all", "8", "6", "ambiguous 6", "7 and centre"],
 )
 def test_published_gaps(R_base_flange: Array, gap: float, atol: float) -> None:
     assert_allclose(second_basin(R_base_flange, GUESS)[0], gap, atol=atol)
@@ -236,22 +228,6 @@ def test_impossible_choices_are_rejected() -> None:
 
 
 # ---- one after the other
-
-
-def test_next_poses_improve_the_prediction_and_open_the_gap() -> None:
-    candidates = cone_candidates(np.deg2rad(40), spins=6, directions=40)
-    R = np.zeros((0, 3, 3))
-    sigmas, gaps = [], []
-    for _ in range(12):
-        ranked = next_pose(R, candidates, GUESS)
-        assert sorted(ranked.tolist()) == list(range(len(candidates)))
-        R = np.concatenate([R, candidates[ranked[:1]]])
-        prediction = predicted_sigma(R, GUESS)
-        sigmas.append([prediction.force_rms_N, prediction.torque_rms_Nm, norm(prediction.sigma["mass_kg"])])
-        gaps.append(prediction.second_basin_gap)
-    assert np.isinf(sigmas[1]).all()
-    assert (np.diff(sigmas[3:], axis=0) < 0).all()
-    assert max(gaps[5:]) > 0.02
 
 
 def test_next_pose_is_the_best_by_brute_force() -> None:
