@@ -39,7 +39,7 @@ def test_a_line_without_an_end_is_not_read_whole(tmp_path: Path) -> None:
             next(lines)
 
 
-@pytest.mark.parametrize("depth", [*range(200, 1200, 40), 50_000])
+@pytest.mark.parametrize("depth", [200, 1000, 50_000])
 def test_nested_brackets_are_no_defect(depth: int) -> None:
     """At a depth that can be parsed, the checksum may still be too deep."""
     content = '{"checksum": "x", "a": ' + "[" * depth + "]" * depth + "}"

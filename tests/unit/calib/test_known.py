@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import Parameters
 from ftcalib.known import Constraints, Known, turn_between, unit_vector
-from ftcalib.model import Array, angle_between
+from ftcalib.model import Array
 
 RNG = np.random.default_rng(0)
 MOUNT = Rotation.from_euler("ZYX", [50, 10, 175], degrees=True).as_matrix()
@@ -50,41 +50,6 @@ def angle_between_directions(a: Array, b: Array) -> float:
     return float(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b)))
 
 
-@pytest.mark.parametrize(
-    ("known", "fixed"),
-    [
-        (Known(), 0),
-        (Known(R_flange_sensor=MOUNT, yaw_only=True), 2),
-        (Known(gravity_direction_base=DOWN), 2),
-        (Known(mass_kg=2.0), 1),
-        (Known(R_flange_sensor=MOUNT, gravity_direction_base=DOWN, mass_kg=2.0), 6),
-    ],
-)
-def test_what_is_exactly_known_stays_along_free_directions(known: Known, fixed: int) -> None:
-    constraints = Constraints(known, 9.8)
-    p = constraints.satisfy(TOOL)
-    Z = constraints.free(p)
-    assert Z.shape == (15, 15 - fixed)
-    assert constraints.dof == fixed
-    assert constraints.any == bool(fixed)
-    np.testing.assert_allclose(Z.T @ Z, np.eye(15 - fixed), atol=1e-12)
-    assert constraints.measurements(p)[0].shape == (0, 15)
-    moved = p.moved(Z @ (1e-6 * RNG.normal(size=15 - fixed)))
-    if known.gravity_direction_base is not None:
-        np.testing.assert_allclose(unit_vector(p.gravity_force_base_N), unit_vector(DOWN), atol=1e-12)
-        np.testing.assert_allclose(unit_vector(moved.gravity_force_base_N), unit_vector(DOWN), atol=1e-10)
-    if known.mass_kg is not None:
-        assert np.linalg.norm(p.gravity_force_base_N) == pytest.approx(19.6, abs=1e-12)
-        assert np.linalg.norm(moved.gravity_force_base_N) == pytest.approx(19.6, abs=1e-10)
-    else:
-        assert np.linalg.norm(p.gravity_force_base_N) == pytest.approx(np.linalg.norm(TOOL.gravity_force_base_N))
-    if known.R_flange_sensor is not None and not known.yaw_only:
-        assert angle_between(moved.R_flange_sensor, p.R_flange_sensor) < 1e-12
-    if known.yaw_only:
-        z = np.array([0.0, 0, 1])
-        np.testing.assert_allclose(moved.R_flange_sensor @ p.R_flange_sensor.T @ z, z, atol=1e-12)
-
-
 def test_a_tolerance_fixes_nothing() -> None:
     soft = Constraints(Known(MOUNT, 1e-9, False, DOWN, 1e-9, 2.0, 1e-9), 9.8)
     np.testing.assert_array_equal(soft.free(TOOL), np.eye(15))
@@ -98,28 +63,6 @@ def test_starts_respect_the_known_mounting() -> None:
     (only,) = Constraints(Known(R_flange_sensor=MOUNT), 9.8).rotations(minima, none)
     np.testing.assert_array_equal(only, MOUNT)
     assert len(Constraints(Known(R_flange_sensor=MOUNT, R_tolerance_rad=0.1), 9.8).rotations(minima, none)) == 4
-
-
-@pytest.mark.parametrize("angle_rad", [0.3, 5.5])
-def test_yaw_starts_near_the_two_lowest_of_twelve_times_two_angles(angle_rad: float) -> None:
-    """The cost of a turn is `-cos(2 (angle - least)) - 0.1 cos(angle - least)`: two minima, the first the lower."""
-    z, here = np.array([0.0, 0, 1]), np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0])
-    across = np.cross(z, here)
-
-    def row(v: Array) -> Array:
-        """Give what multiplies `R_flange_sensor.T.ravel()` to `v @ R_flange_sensor @ x`."""
-        return np.asarray(np.kron(MOUNT.T @ [1.0, 0, 0], v), dtype=np.float64)
-
-    Q = np.outer(row(across), row(across)) - np.outer(row(here), row(here)) - 0.1 * np.outer(row(here), row(z))
-    known = Known(R_flange_sensor=MOUNT, yaw_only=True)
-    found = Constraints(known, 9.8).rotations([], (Q + Q.T) / 2)
-    angles = [Rotation.from_matrix(R @ MOUNT.T).as_rotvec() for R in found]
-    assert len(found) == 2
-    np.testing.assert_allclose([v[:2] for v in angles], 0, atol=1e-12)
-    off = [(v[2] - angle_rad) % np.pi for v in angles]
-    assert max(min(one, np.pi - one) for one in off) <= np.pi / 24 + 1e-9
-    soft = Known(R_flange_sensor=MOUNT, yaw_only=True, R_tolerance_rad=0.1)
-    assert len(Constraints(soft, 9.8).rotations([MOUNT], (Q + Q.T) / 2)) == 3
 
 
 @pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1.0, np.pi])

@@ -386,18 +386,3 @@ def test_arrays_of_another_shape_or_without_numbers_are_refused() -> None:
             replace(RESULT, **{name: value})
     right: dict[str, Any] = {"measured_sigma": np.ones(6), "weights": np.ones(10), "cable_shift": np.ones(15)}
     assert replace(RESULT, **right).weights is not None
-
-
-def test_the_shown_error_is_given_for_here_anywhere_and_later() -> None:
-    quality = {
-        f"{name}_{unit}": value * scale
-        for name, value in (("next_use", 1.0), ("workspace", 3.0))
-        for unit, scale in (("force_rms_N", 0.1), ("torque_rms_Nm", 0.01))
-    }
-    seen = replace(RESULT, quality={**RESULT.quality, **quality})
-    np.testing.assert_allclose(seen.likely_error(), [0.1, 0.01])
-    np.testing.assert_allclose(seen.likely_error("workspace"), [0.3, 0.03])
-    without = replace(RESULT, quality={name: value for name, value in quality.items() if name.startswith("next_use")})
-    np.testing.assert_array_equal(without.likely_error("workspace"), without.likely_error())
-    assert np.isnan(without.likely_error("hour")).all()  # the tour shows no drift
-    assert np.isnan(replace(RESULT, quality={}).likely_error("hour")).all()

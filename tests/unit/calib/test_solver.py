@@ -88,22 +88,11 @@ def test_yu_table_1_is_exact_without_noise(method: Method, measured: bool, setup
     assert np.abs(error).max() < 2e-12  # 1.0e-12 with NumPy 2.5
 
 
-@pytest.mark.parametrize("n", [4, 7])
-def test_any_mounting_is_found_from_any_orientations(n: int) -> None:
-    rng = np.random.default_rng(n)
-    for _ in range(5):
-        R = Rotation.random(n, rng=rng).as_matrix()
-        truth = Parameters(Rotation.random(rng=rng).as_matrix(), *(rng.normal(size=(4, 3)) * [[9], [9], [0.1], [1]]))
-        result = solve(dataset(R, predict(truth, R), white(n)))
-        assert np.abs(truth.difference(result.parameters)).max() < 1e-10
-        assert result.chi2 < 1e-15
-
-
 @pytest.mark.parametrize(
     ("orientations", "seed", "runs"),
     [
         ("24", 1, 40),
-        pytest.param("7", 2, 40, marks=pytest.mark.slow),
+        pytest.param("7", 2, 80, marks=pytest.mark.slow),
     ],
 )
 def test_the_covariance_is_honest(orientations: str, seed: int, runs: int) -> None:
@@ -466,27 +455,6 @@ def test_a_real_session_with_drift_is_not_called_good() -> None:
     static = solve(real("foamcutting_2013_06_12"), drift="none")
     assert static.mass_kg == pytest.approx(0.474, abs=0.01)
     assert static.drift is None
-
-
-@pytest.mark.parametrize("method", ["vougioukas", "yang"])
-def test_a_baseline_counts_only_the_parameters_that_it_estimates(method: Method) -> None:
-    rng = np.random.default_rng(3)
-    R = Rotation.random(5, rng=rng).as_matrix()
-    truth = Parameters(
-        np.eye(3),
-        np.array([0, 0, -20.0]),
-        np.array([1.0, 2, 3]),
-        np.array([0.01, 0.02, 0.08]),
-        np.array([0.1, 0.2, 0.3]),
-    )
-    sigma = np.repeat([0.02, 0.0005], 3)
-    wrench = predict(truth, R) + rng.normal(0.0, sigma, (5, 6))
-    about = Known(R_flange_sensor=np.eye(3), R_tolerance_rad=0.05)  # of which a baseline takes no tolerance
-    data = CalibrationDataset.of(R, wrench, wrench_cov=np.diag(sigma**2), n_samples=1000)
-    result = solve(data, method, known=about)
-    assert result.dof == 30 - {"vougioukas": 10, "yang": 13}[method]
-    assert result.verdict == "usable"
-    assert "there are only 5 poses" in result.reasons[0]
 
 
 def test_a_sensor_with_an_arbitrary_zero_may_have_any_bias() -> None:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Parameters, Setup, solve
 from ftcalib.after.state import apply_update
 from ftcalib.after.verification import Verification, expected_with_smooth_errors, verify_calibration
-from ftcalib.model import Array, DriftResult, predict
+from ftcalib.model import Array, predict
 from ftcalib.poses.information import SUBSET_6, special
 from ftcalib.sensor_matrix import response_columns
 from tests.known_cells import UPRIGHT as TRUTH
@@ -143,23 +143,6 @@ def test_errors_of_each_pose_that_the_fit_found_are_expected_again() -> None:
     assert verify_calibration(aware, orientations(6), wrench, noise_of(6)).passed
     noisy = replace(calibration, components={"white_force_N": 0.05, "white_torque_Nm": 0.004})
     assert verify_calibration(noisy, orientations(6), wrench, noise_of(6)).passed
-
-
-def test_a_bias_that_walked_in_the_tour_may_walk_on() -> None:
-    calibration = calibrated()
-    walk = np.cumsum(np.random.default_rng(7).normal(size=(6, 6)) * np.repeat([0.05, 0.001], 3), axis=0)
-    wrench = readings(TRUTH, orientations(6), 8) + 1.5 * walk[-1] + walk
-    assert not verify_calibration(calibration, orientations(6), wrench, noise_of(6)).passed
-    walking = replace(calibration, components={"walk_force_N": 0.05, "walk_torque_Nm": 0.001})
-    found = verify_calibration(walking, orientations(6), wrench, noise_of(6))
-    assert found.passed
-    jumped = verify_calibration(walking, orientations(6), wrench + np.array([2.0, 0, 0, 0, 0, 0]), noise_of(6))
-    assert (jumped.passed, jumped.change) == (False, "bias")
-    drift = DriftResult(np.repeat([0.4, 0.005], 3), np.full(6, 0.01))
-    linear = replace(calibration, drift=drift)
-    ramp = readings(TRUTH, orientations(6), 8) + np.outer(0.5 + np.arange(6) / 24, drift.change)
-    assert not verify_calibration(calibration, orientations(6), ramp, noise_of(6)).passed
-    assert verify_calibration(linear, orientations(6), ramp, noise_of(6)).passed
 
 
 def inexact(poses: int, seed: int) -> tuple[CalibrationDataset, Array, Array]:

@@ -172,25 +172,6 @@ def test_the_covariance_has_all_errors_of_readings_and_calibration() -> None:
     assert (found.dof, found.poses) == (17, 3)
 
 
-def test_the_covariance_of_a_tool_with_a_part_has_the_errors_of_both() -> None:
-    tool, C, response = rough(2)
-    empty = Calibrated(tool, C[:15, :15], response)
-    rng = np.random.default_rng(3)
-    root = np.array([0.02, 1e-3, 1e-3, 1e-3])[:, None] * (np.eye(4) + 0.3 * rng.normal(size=(4, 4)))
-    x, x_cov = np.array([0.8, 0.01, -0.02, 0.09]), root @ root.T
-
-    def joined(e: Array, x: Array = x) -> Array:
-        weight = Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1, moment=(x, x_cov))
-        load = holding(moved(empty, e), weight, G)
-        assert load.response is not None
-        return np.concatenate([tool.difference(load.parameters), load.response.coefficients])
-
-    found = holding(empty, Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1, moment=(x, x_cov)), G)
-    expected = propagated(joined, C) + propagated(lambda e: joined(np.zeros(len(C)), x + e), x_cov)
-    assert found.response is not None
-    assert_same(found.response.covariance, expected)
-
-
 def test_a_tool_with_a_part_predicts_both() -> None:
     z2 = []
     for seed in range(40):

@@ -148,18 +148,6 @@ def test_the_hash_follows_the_content_not_the_layout() -> None:
     assert dataset(wrench=changed(data.wrench, (0, 0), 1e-300)).sha256() != data.sha256()
 
 
-def test_a_file_is_never_overwritten_and_never_half(tmp_path: Path) -> None:
-    path = tmp_path / "d.json"
-    dataset().save(path)
-    before = path.read_bytes()
-    with pytest.raises(FileExistsError, match=r"d\.json exists already"):
-        dataset(meta={}).save(path)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-    with pytest.raises(FileNotFoundError, match="folder"):
-        dataset().save(tmp_path / "no" / "d.json")
-
-
 def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")

@@ -12,7 +12,6 @@ from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Finding, 
 from ftcalib.judge.faults import (
     EULER_ORDERS,
     broken_channels,
-    constant_weight,
     faults,
     other_poses,
 )
@@ -197,24 +196,6 @@ def test_orientations_in_left_handed_axes_are_named() -> None:
     assert first(SWAP @ R @ SWAP, wrench).code == "forces_reversed"
 
 
-@pytest.mark.parametrize(
-    ("force", "torque", "pair"),
-    [
-        (9.80665e-3, 1.0, ["gf", "N·m"]),
-        (1e-3, 1.0, ["mN", "N·m"]),
-        (1e3, 1e3, ["kN", "kN·m"]),
-    ],
-)
-def test_a_factor_of_1000_is_named_without_a_known_mass(force: float, torque: float, pair: list[str]) -> None:
-    p, R, wrench = session(7)
-    wrench /= np.repeat([force, torque], 3)
-    assert pair in first(R, wrench).values["units"]
-    if pair == ["mN", "N·m"]:
-        mass_kg = float(np.linalg.norm(p.gravity_force_base_N)) / 9.80665
-        assert first(R, wrench, payload_kg=mass_kg).values["units"][0][0] == pair[0]
-        assert first(R, wrench, Known(mass_kg=mass_kg, mass_tolerance_kg=0.01)).values["units"][0][0] == pair[0]
-
-
 @pytest.mark.parametrize(("Q", "group"), [(SWAP, "torque"), (CYCLE, "force")])
 def test_axes_that_disagree_are_named_with_their_order(Q: Array, group: str) -> None:
     _, R, wrench = session(4)
@@ -305,20 +286,6 @@ def test_rotation_vectors_in_degrees_are_refused(tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_text(f"rx,ry,rz,fx,fy,fz,tx,ty,tz\n{rows}\n")
     with pytest.raises(BadDataset, match="is in degrees, or is three angles"):
         read_dataset(tmp_path / "poses.csv")
-
-
-@pytest.mark.parametrize(
-    ("off_deg", "spread", "constant"), [(9.9, 0.049, True), (10.1, 0.049, False), (9.9, 0.051, False)]
-)
-def test_a_constant_force_that_points_down_is_a_weight_in_base_axes(
-    off_deg: float, spread: float, constant: bool
-) -> None:
-    up = np.array([0.0, 2.0, 0.0])
-    mean = 20 * np.array([np.sin(np.radians(off_deg)), -np.cos(np.radians(off_deg)), 0.0])
-    wrench = np.tile(np.append(mean, np.zeros(3)), (12, 1))
-    wrench[:, 2] += 20 * spread * np.where(np.arange(12) % 2, 1, -1)
-    found = constant_weight(wrench, up)
-    assert [one.code for one in found] == ["constant_force"] * constant
 
 
 @pytest.mark.parametrize("side", [1, -1])

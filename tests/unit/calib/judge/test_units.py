@@ -5,7 +5,7 @@ import pytest
 from scipy import constants
 
 from ftcalib import Parameters
-from ftcalib.judge.units import FORCE_UNITS_N, TORQUE_UNITS_NM, by_mass, implausible, unit_of_force
+from ftcalib.judge.units import FORCE_UNITS_N, TORQUE_UNITS_NM, implausible, unit_of_force
 
 
 def found(
@@ -62,13 +62,6 @@ def test_a_centre_of_mass_of_no_tool_is_named(com_m: float, described: bool, exp
     assert [
         (code, severity, most_m) for code, severity, _, most_m in found(20.0, com_m, described=described)
     ] == expected
-
-
-def test_a_mass_agrees_with_another_in_the_unit_that_makes_it_so() -> None:
-    assert by_mass(4.5, 20.0, 0.01) == ["lbf"]
-    assert by_mass(4.5, 20.5, 0.01) == []
-    assert by_mass(20.0, 20.0, 0.01) == []
-    assert by_mass(4.5, 0.0, 0.01) == []
 
 
 @pytest.mark.parametrize(

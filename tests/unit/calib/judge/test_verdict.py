@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -186,26 +185,6 @@ def test_errors_are_stated_relative_to_the_weight() -> None:
     assert 10 < error.values["share_percent"] < 20
 
 
-def test_few_poses_and_rejected_poses_are_reported() -> None:
-    rng = np.random.default_rng(12)
-    five = R24[[0, 6, 10, 15, 21]]
-    quality = judge(fit(five, noisy(rng, five), white(5)))
-    assert (quality.verdict, the("few_poses", quality).values["n_poses"]) == ("usable", 5)
-
-    wrench = noisy(rng, R24)
-    for bumped, verdict in (([4, 9], "good"), ([4, 9, 11, 20], "usable")):
-        hit = wrench.copy()
-        hit[bumped, 2] += 5
-        weights = np.ones(24)
-        weights[bumped] = 0
-        quality = judge(fit(R24, hit, white(24), weights=weights))
-        assert quality.verdict == verdict
-        rejected = {"count": len(bumped), "n_poses": 24, "poses": [k + 1 for k in bumped]}
-        assert the("poses_rejected", quality).values == rejected
-        assert quality.loo_force_rms_N < 0.15
-        assert quality.worst_pose not in bumped
-
-
 @pytest.mark.parametrize("channel", [2, 3])
 def test_what_is_known_is_doubted_where_the_data_fit_without_it(channel: int) -> None:
     wrench = noisy(np.random.default_rng(24), R24)
@@ -285,41 +264,11 @@ def test_nothing_is_suspected_of_a_sound_sensor() -> None:
         assert not DISAGREE & set(codes(solved(R, wrench)))
 
 
-def test_inverted_orientations_are_detected() -> None:
-    R = Rotation.random(10, rng=np.random.default_rng(20)).as_matrix()
-    result = solved(np.swapaxes(R, 1, 2), noisy(np.random.default_rng(21), R))
-    assert (result.verdict, result.findings[0].code) == ("rejected", "orientations_inverted")
-
-
 # Limits
 
 
 FITTED = fit(R24, noisy(np.random.default_rng(30), R24), white(24))
 WEIGHT_N = FITTED.parameters.weight_N
-
-
-def statistics(**values: Any) -> Quality:
-    """Of 24 good poses, except for these values."""
-    usual = {
-        "used": np.ones(24, bool),
-        "is_exact": False,
-        "accidents": True,
-        "residual_sigma": np.ones(24),
-        "worst_pose": 3,
-    }
-    usual |= {"lag1": 0.3, "lag1_p": 0.5, "largest_share": 0.001, "noise_factor": 1.0, "chi2_p": 0.5}
-    one = SimpleNamespace(**usual | values)
-    one.fits_measured_noise = one.chi2_p is not None and one.chi2_p >= 1e-3
-    return cast(Quality, one)
-
-
-@pytest.mark.parametrize(("sigmas", "significant"), [(4.9, False), (5.1, True)])
-def test_a_weight_is_one_from_five_sigmas_on(sigmas: float, significant: bool) -> None:
-    along = FITTED.parameters.gravity_force_base_N / WEIGHT_N
-    across = np.cross(along, [1.0, 0, 0])
-    covariance = 1e-9 * np.eye(15)
-    covariance[3:6, 3:6] += (WEIGHT_N / sigmas) ** 2 * np.outer(along, along) + 1e3 * np.outer(across, across)
-    assert ("weight_insignificant" in codes(judge(replace(FITTED, covariance=covariance)))) != significant
 
 
 SMOOTH = {"response_not_linear", "cable_acts", "orientations_smoothly_off"}

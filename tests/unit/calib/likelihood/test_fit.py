@@ -128,7 +128,7 @@ def test_no_start_reaches_a_lower_minimum(n: int, degrees: float, weight_in_sigm
 def test_the_odds_of_the_second_basin_are_those_of_being_wrong() -> None:
     azimuth = np.arange(8) * np.pi / 4
     expected, wrong, seen = 0.0, 0, 0
-    for seed in range(60):
+    for seed in range(120):
         rng = np.random.default_rng(seed)
         lean = np.deg2rad(40) * np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
         lean[0] *= rng.uniform(0.4, 1)  # all but one of the same tilt: up and down look alike
@@ -139,7 +139,7 @@ def test_the_odds_of_the_second_basin_are_those_of_being_wrong() -> None:
             seen += 1
             expected += 1 / (1 + np.exp(best.second_basin_chi2 / 2))
             wrong += bool(np.linalg.norm(best.parameters.difference(p)[:3]) > np.pi / 2)
-    assert seen > 10
+    assert seen > 20
     assert abs(wrong - expected) < 3 * np.sqrt(expected)
 
 
@@ -161,21 +161,11 @@ def test_bumped_poses_are_rejected_and_no_others() -> None:
     assert (squared(best, p) / bound(p, R[bumped:], np.linalg.inv(WHITE)) < 4).all()
 
 
-def test_seven_poses_are_never_split_into_right_and_wrong() -> None:
-    rng = np.random.default_rng(3)
-    p, R = truth(rng), haar(rng, 7)
-    wrench = predict(p, R) + noise(rng, 7)
-    wrench[2, :3] += 5
-    best = fit(R, wrench, WHITE)
-    assert best.weights.all()
-    assert best.measured_chi2 > stats.chi2.isf(1e-6, best.dof)
-
-
 @pytest.mark.slow
 def test_inexact_orientations_are_found_and_weighed() -> None:
     sigma, turn = SIGMA / 10, np.deg2rad(0.3)
     error, least, found = np.zeros(5), np.zeros(5), []
-    for seed in range(10):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         p, R = truth(rng), haar(rng, 24)
         wrench = predict(p, R) + noise(rng, 24, sigma)

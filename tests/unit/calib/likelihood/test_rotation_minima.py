@@ -123,17 +123,6 @@ def test_brute_force_finds_no_other_minimum() -> None:
         assert nearest(found, (grid[int(i)] * Rotation.from_rotvec(end.x)).as_matrix()) < 1e-3
 
 
-def test_constant_tilt_leaves_the_sign_of_gravity_open() -> None:
-    tilt = Rotation.from_rotvec([np.deg2rad(140), 0, 0])
-    turn = Rotation.from_rotvec(np.outer(np.linspace(0, 5, 8), [0, 0, 1]))
-    R_base_flange, R = (turn * tilt * turn.inv()).as_matrix(), Rotation.random(rng=np.random.default_rng(2)).as_matrix()
-    force = forces(R_base_flange, R, gravity_N=np.array([0, 0, -40.0]))
-    best, second, *_ = rotation_minima.minima(rotation_minima.force_cost(R_base_flange, force, np.ones(8)))
-    assert second.cost == pytest.approx(best.cost, abs=1e-9)
-    assert nearest([best, second], R) < 1e-9
-    assert angle(best.R, second.R @ np.diag([-1.0, -1, 1])) < 1e-9
-
-
 def yaw_only() -> Array:
     tilt, turn = Rotation.from_rotvec([2.5, 0, 0]), Rotation.from_rotvec(np.outer(np.arange(5), [0, 0, 1]))
     R_base_flange = (tilt * turn).as_matrix()

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.descent import Minimum
-from ftcalib.likelihood.session import SessionData, white
+from ftcalib.likelihood.session import SessionData
 from ftcalib.likelihood.session_noise import pose_times
 from ftcalib.likelihood.variance_components import RESPONSE, Component
 from ftcalib.model import Array, predict
@@ -27,33 +26,6 @@ def test_directions_are_open_whatever_their_units(left: float, lacks: bool) -> N
     alike[3, 7] = alike[7, 3] = 1 - left  # eigenvalues `left` and 2 - `left`
     units = 10.0 ** np.arange(-7, 8)
     assert session(R24).lacks_rank(minimum(alike * np.outer(units, units))) == lacks
-
-
-def test_degrees_of_freedom_are_numbers_read_less_numbers_estimated() -> None:
-    kept = np.arange(24) % 4 > 0
-    for known, fewer in ((Known(), 0), (Known(mass_kg=2.0), 1), (Known(R_flange_sensor=np.eye(3)), 3)):
-        constraints = Constraints(known, 9.8)
-        assert session(R24, known=constraints).dof(kept) == 6 * 18 - (15 - fewer)
-        assert session(R24, known=constraints, drift="linear").dof(kept) == 6 * 18 - (15 - fewer) - 6
-    two = session(R24[:2], known=Constraints(Known(R_flange_sensor=np.eye(3)), 9.8))
-    assert two.lacks_rank(minimum(np.eye(15)))  # 12 numbers for 12 unknowns leave nothing to judge them by
-    three = session(R24[:3], known=Constraints(Known(R_flange_sensor=np.eye(3)), 9.8))
-    assert not three.lacks_rank(minimum(np.eye(15)))
-
-
-def test_noise_that_was_not_measured_is_at_least_a_thousandth_of_the_residuals_and_rounding() -> None:
-    residuals = np.tile([0.3, -0.3, 0.3, -0.01, 0.01, 0.01], (24, 1)) * np.where(np.arange(24) % 2, 1, -1)[:, None]
-    own = session(R24, measured=False, residuals=residuals)
-    np.testing.assert_allclose(own.least_noise(TOOL)[5], white(0.3e-3, 0.01e-3))
-    largest_N, largest_Nm = np.abs(own.wrench[:, :3]).max(), np.abs(own.wrench[:, 3:]).max()
-    np.testing.assert_allclose(own.cov[5], white(1e-12 * largest_N, 1e-12 * largest_Nm))
-    exact = session(R24, measured=False)
-    np.testing.assert_allclose(exact.least_noise(TOOL), np.broadcast_to(exact.cov, (24, 6, 6)))
-    residuals[:, :3] = 0.0
-    exact_forces = session(R24, measured=False, residuals=residuals)
-    np.testing.assert_allclose(
-        exact_forces.noise_left(TOOL)[5], white(4e-3 * np.sqrt(144 / 129), 0.01 * np.sqrt(144 / 129))
-    )
 
 
 @pytest.mark.parametrize(("share", "exact"), [(0.9, True), (1.1, False)])

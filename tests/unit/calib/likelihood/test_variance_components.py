@@ -147,19 +147,6 @@ def test_the_restricted_likelihood_is_that_of_error_contrasts() -> None:
     np.testing.assert_allclose(np.diff(ours), np.diff([exact(theta) for theta in thetas]), atol=1e-8)
 
 
-def test_nothing_is_found_where_nothing_is_and_the_walk_where_one_is() -> None:
-    candidates = [*ALL[:3], WALK_FORCE, WALK_TORQUE]
-    spurious, right = 0, 0
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        spurious += len(select_explanation(problem(rng, 30, (), np.zeros(0)), [], np.zeros(0), candidates).components)
-        walk = WALK_FORCE
-        at = select_explanation(problem(rng, 30, (walk,), np.array([0.02])), [], np.zeros(0), candidates)
-        right += walk in at.components
-    assert spurious <= 4  # 2 % each, of 100
-    assert right >= 19
-
-
 def test_what_others_make_needless_is_dropped() -> None:
     white, walk = WHITE_FORCE, WALK_FORCE
     both = (white, walk)

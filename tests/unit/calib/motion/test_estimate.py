@@ -10,10 +10,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import Array, skew
 from ftcalib.motion.estimate import (
-    TOUCH_N,
-    TOUCH_NM,
     _first_kept,
-    _untouched,
     fit_motion,
     rough_delay,
 )
@@ -240,14 +237,6 @@ def test_sums_of_many_rows_are_those_of_their_parts(posed: Posed) -> None:
     assert chi2 == pytest.approx(float(white @ white))
     np.testing.assert_allclose(H[:SIZE, :SIZE], derivative.T @ derivative, rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(b[:SIZE], derivative.T @ white, rtol=1e-9, atol=1e-6)
-
-
-@pytest.mark.parametrize(("channel", "limit"), [(1, TOUCH_N), (4, TOUCH_NM)])
-def test_a_guarded_motion_has_contact_only_above_a_touch(channel: int, limit: float) -> None:
-    residuals = np.zeros((9, 6))
-    for size, left_out in ((0.95, 0), (1.05, 5)):
-        residuals[4, channel] = -size * limit
-        assert np.count_nonzero(~_untouched(residuals)) == left_out
 
 
 def test_contact_is_first_judged_by_the_quiet_rows_of_each_state() -> None:

@@ -93,15 +93,6 @@ def test_a_sweep_gives_all_that_motion_shows(result: CalibrationResult) -> None:
     assert np.abs(step).max() < 4
 
 
-def test_the_file_keeps_the_motion(result: CalibrationResult) -> None:
-    again = CalibrationResult.from_dict(result.to_dict())
-    assert again.id == result.id
-    assert again.motion is not None
-    assert result.motion is not None
-    np.testing.assert_array_equal(again.motion.inertia_kg_m2, result.motion.inertia_kg_m2)
-    assert again.sigma["delay_s"] == result.sigma["delay_s"]
-
-
 def test_contact_is_left_out_and_listed() -> None:
     joints, stops = programme(4, 20.0)
     touched = {(start + 0.1, end): np.r_[0, 0, -6.0, 0.1, 0, 0] for start, end in stops[1::2]}

@@ -17,7 +17,6 @@ from ftcalib.motion.solve import (
     SLOW_RAD_S,
     _coarse_delay,
     _motion_findings,
-    _narrow_findings,
     _other_wrench,
     _require_enough_motion,
     _select_rows,
@@ -141,28 +140,6 @@ def test_what_the_motion_does_not_show_is_named() -> None:
     known = found(best_of(prior_share=share.copy()), motion_result())["motion_slow"].values  # a point mass
     assert known == {"names": "the height"}
     assert "motion_slow" not in found(best_of(prior_share=share), motion_result(), positions=False)
-
-
-def of_range(degrees: float) -> MotionRows:
-    rows = rows_of(41, TRUTH)
-    turns = Rotation.from_rotvec(np.outer(np.linspace(-degrees / 2, degrees / 2, 41), [0.0, 0.6, 0.8]), degrees=True)
-    return replace(rows, motion=replace(rows.motion, R_base_flange=turns.as_matrix()))
-
-
-def test_a_narrow_motion_is_named_by_its_range_or_its_error() -> None:
-    covariance = np.zeros((SIZE, SIZE))
-    (one,) = _narrow_findings(of_range(44), best_of(covariance=covariance), explained=False)
-    assert one.severity == "limit"
-    assert _narrow_findings(of_range(46), best_of(covariance=covariance), explained=False) == []
-    covariance[2, 2] = 1.0
-    (one,) = _narrow_findings(of_range(46), best_of(covariance=covariance), explained=False)
-    assert one.severity == "reject"
-    assert one.values["range_deg"] == pytest.approx(46)
-    assert one.values["mounting_deg"] == pytest.approx(np.degrees(1))
-    assert _narrow_findings(of_range(46), best_of(covariance=covariance), explained=True) == []
-    covariance[2, 2], covariance[4, 4] = 1e4, 0.25
-    (one,) = _narrow_findings(of_range(44), best_of(covariance=covariance), explained=True)
-    assert (one.values["mounting_deg"], one.values["weight_N"]) == (180.0, 0.5)
 
 
 def test_a_wrench_without_weight_and_one_of_another_recording_are_named() -> None:

@@ -24,21 +24,9 @@ from ftcalib.published.carlson import (
 Method = Callable[[Array, Array, Array, bool], ForceFit]
 
 
-def nullspace_all_pairs(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
-    """The nullspace method as published, of all pairwise differences, with A base to flange and h eliminated."""
-    eq = carlson._linear_equations(R_base_flange, force_N, bias=bias, method="the nullspace method")
-    i, k = np.triu_indices(len(force_N), 1)
-    A_k_i = R_base_flange[k].transpose(0, 2, 1) @ R_base_flange[i]
-    F = carlson.kron_identity(force_N).reshape(-1, 3, 9)
-    differences = (A_k_i @ F[i] - F[k]).reshape(-1, 9)
-    h_columns = (A_k_i - np.eye(3)).reshape(-1, 3) if bias else np.empty((len(differences), 0))
-    return carlson._fit_vec(eq, carlson._least_singular_vector(h_columns, differences))
-
-
 UNKNOWN: dict[str, Method] = {
     "eigen": lambda R, f, _, bias: eigen(R, f, bias=bias),
     "nullspace": lambda R, f, _, bias: nullspace(R, f, bias=bias),
-    "all pairs": lambda R, f, _, bias: nullspace_all_pairs(R, f, bias=bias),
     "iterative": lambda R, f, _, bias: iterative(R, f, bias=bias),
     "polynomial": lambda R, f, _, bias: polynomial(R, f, bias=bias),
 }
@@ -139,7 +127,7 @@ def test_exact_with_the_fewest_poses_and_one_less_is_rejected(name: str, bias: b
 # --- what a bias does ---
 
 
-@pytest.mark.parametrize("name", [name for name in METHODS if name != "all pairs"])
+@pytest.mark.parametrize("name", METHODS)
 def test_the_original_form_hides_a_bias_in_the_rotation_and_the_other_finds_it(name: str) -> None:
     errors: dict[tuple[float, bool], list[float]] = {(bias_N, bias): [] for bias_N in (0, 1) for bias in (False, True)}
     rng = np.random.default_rng(2)
@@ -266,7 +254,7 @@ def test_known_gravity_needs_a_change_of_tilt(name: str, bias: bool, sigma_N: fl
         METHODS[name](R, truth.force_N(R, sigma_N), truth.gravity_force_base_N, bias)
 
 
-@pytest.mark.parametrize("name", ["eigen", "nullspace", "all pairs", "iterative", "relaxation"])
+@pytest.mark.parametrize("name", ["eigen", "nullspace", "iterative", "relaxation"])
 def test_relaxed_methods_reject_one_tilt_only_with_bias(name: str) -> None:
     R = rim(np.random.default_rng(18), 12, 40)
     truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), np.zeros(3))
