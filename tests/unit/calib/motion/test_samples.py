@@ -195,7 +195,7 @@ def test_samples_that_cannot_be_used_are_refused(wrong: str) -> None:
     ("at", "value", "words"),
     [
         (0.02, 1e308, "sample 3 at 0.02 s has 1e\\+308, more than any device reports"),
-        (1e6, 1.0, "no sample for 1e\\+06 s before sample 3 at 1e\\+06 s: divide the recording there"),
+        (1e6, 1.0, "no sample for 1e\\+06 s before sample 3 at 1e\\+06 s: split the recording there"),
         (1e300, 1.0, "sample 3 at 1e\\+300 s"),
     ],
 )
