@@ -186,7 +186,7 @@ class RobotiqFt300(StreamingSensor):
         host, written = _host_and_port(address)
         port = options.integer("port", PORT if written is None else written, 1, 65535)
         if written not in {None, port}:
-            raise ValueError(f"it has two ports, {written} and {port}; leave one out")
+            raise ValueError(f"the address has two ports, {written} and {port}; leave one out")
         return RobotiqUrcap(host, port=port, sign=sign, clock=clock)
 
     def _connect(self) -> DeviceInfo:

@@ -68,7 +68,7 @@ class Chain:
             self._joints.insert(0, joints[link])
             link = joints[link].parent
         if base and link != base:
-            raise BadUrl(f"{path}: {flange} is not a descendant of {base}: exchange both, or give another base")
+            raise BadUrl(f"{path}: {flange} is not a descendant of {base}: swap the two, or give another base")
         self.names = [joint.name for joint in self._joints if joint.kind in _MOVES]
         if not self.names:
             raise BadUrl(f"{path}: no joint moves between {base or link} and {flange}: give other links")

@@ -168,7 +168,7 @@ def test_joints_that_cannot_be_used_are_one_sentence(
         ("tf needs base and flange", "ros2:tf?base=base"),
         ("unknown option parent", "ros2:tf?base=base&flange=f&parent=x"),
         ("option is given twice", "ros2:tf?base=base&base=other&flange=f"),
-        ("base and flange go with tf or urdf", "ros2:/pose?flange=f"),
+        ("base and flange apply only to tf and urdf", "ros2:/pose?flange=f"),
         ("option 'flange' is missing", "ros2:/joints?urdf={urdf}"),
         ("has no link 'flang': did you mean flange", "ros2:/joints?urdf={urdf}&flange=flang"),
         ("link0 is not a descendant of link7", "ros2:/joints?urdf={urdf}&flange=link0&base=link7"),

@@ -425,7 +425,7 @@ def test_a_follower_finds_silence_as_quickly_as_a_look(
         controller.silent = True
         heard_s = clock.now_s()
         assert len(follow.read(0.05)) == 5
-        with pytest.raises(DeviceTimeout, match=r"stood still at 100\.\d{3} s for 0\.20 s"):  # noqa: PT012
+        with pytest.raises(DeviceTimeout, match=r"stuck at 100\.\d{3} s for 0\.20 s"):  # noqa: PT012
             for _ in range(100):
                 follow.read(0.01)
         assert clock.now_s() - heard_s == pytest.approx(0.2, abs=0.003)

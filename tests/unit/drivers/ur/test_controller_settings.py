@@ -53,7 +53,7 @@ def test_before_5_10_the_payload_has_no_inertia(
     controller.did.clear()
     arm.set_payload(1.0, (0, 0, 0.05))
     assert controller.did == ["payload 1 [0.0, 0.0, 0.05]"]
-    with pytest.raises(DeviceFault, match="accepts no inertia"):
+    with pytest.raises(DeviceFault, match="does not accept the inertia"):
         arm.set_payload(1.0, (0, 0, 0.05), INERTIA)
     assert len(controller.did) == 1
 
