@@ -68,9 +68,9 @@ def solve(
         table with closely spaced rows, a bag, a file of `ftdrive record` and a result of `read_recording` are
         recordings in motion.
     method : Method
-        "ml": maximum likelihood, from 4 poses on; or one of the published methods, for comparison.
+        "ml": maximum likelihood, which needs at least 4 poses; or one of the published methods, for comparison.
     table : TableOptions, optional
-        Description of a table, for what the table does not contain.
+        What the table itself does not contain.
     drift, known, g_m_s2, setup, provenance, as_published
         As for `ftcalib.solver.solve`. For a recording in motion, only `known` and the up direction of `setup` are used.
 
@@ -83,7 +83,7 @@ def solve(
     ValueError
         The method is unknown, cannot use the known values, or does not support `as_published`.
     TypeError
-        The source has another type; the message names the right call.
+        The type of the source is not supported; the message names the right call.
 
     Examples
     --------
@@ -135,7 +135,7 @@ def read_recording(
     calibration : CalibrationResult, optional
         Calibration for a recording of another program, which has none; `raw` is the measured wrench, `wrench` is 0.
     table : TableOptions, optional
-        Description of a table, for what the table does not contain.
+        What the table itself does not contain.
 
     Raises
     ------

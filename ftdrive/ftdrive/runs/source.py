@@ -407,7 +407,7 @@ def read_dataset(
     OSError
         The file cannot be read.
     TypeError
-        The source has another type; the message names the right call.
+        The type of the source is not supported; the message names the right call.
 
     Examples
     --------

@@ -227,8 +227,8 @@ def _gravity_to_set(result: CalibrationResult, lean: Lean, old: ControllerSettin
     # Without a report of the controller's gravity, a change could neither be read back nor be restored.
     if old.up_base_m_s2 is None:
         raise NotAccepted(
-            f"the controller does not report its gravity, so a change could not be read back; the base {lean}, "
-            "compared with [workcell] mounting: set the mounting at the pendant"
+            f"the base {lean} relative to [workcell] mounting, and this controller does not report its gravity vector, "
+            "so a change could not be verified: set the mounting on the pendant"
         )
     if lean.is_other_mounting:
         raise NotAccepted(
