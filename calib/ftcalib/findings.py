@@ -325,9 +325,8 @@ CODES: Final[Mapping[str, Code]] = {
         "program zeroes it, look for a cable that pulls"),
     "sensor_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on, the sensor is turned by {turn_deg:.2g}",
         "fasten its screws and calibrate again"),
-    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on, the readings look like those of another sensor: "
-        "turned by {turn_deg:.2g}, bias changed by {force_N:.2g} and {torque_Nm:.2g}",
-        "calibrate each sensor by itself"),
+    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on, another sensor seems to be in use: turned by "
+        "{turn_deg:.2g}, bias changed by {force_N:.2g} and {torque_Nm:.2g}", "calibrate each sensor by itself"),
     "sensors_alternate": Code(_REJECT, "every other pose looks like another sensor: turned by {turn_deg:.2g}, bias "
         "changed by {force_N:.2g} and {torque_Nm:.2g}", "separate the readings of the sensors"),
     "drift": Code(_LIMIT_OR_NOTE, "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the "
@@ -335,8 +334,8 @@ CODES: Final[Mapping[str, Code]] = {
     "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is less than {least_sigmas:g} times its "
         "uncertainty of {sigma_N:.2g}", "record the raw wrench if it was compensated, or zeroed at each pose. "
         "Otherwise keep the tool free of contact, or hang something heavier on the sensor"),
-    "second_solution": Code(_REJECT, "a very different mounting explains the data almost as well (probability "
-        "{probability_percent:.2g})", "add poses with another angle between the tool and the vertical"),
+    "second_solution": Code(_REJECT, "a very different mounting (probability {probability_percent:.2g}) explains the "
+        "data almost as well", "add poses with another angle between the tool and the vertical"),
     "torques_about_point": Code(_LIMIT, "the centre of mass is {inside_mm:.0f} behind the sensor, as if torques were "
         "about a point in front of it", "add --wrench-frame tcp --tcp X,Y,Z,RX,RY,RZ, or record the torques about the "
         "sensor"),
@@ -401,9 +400,9 @@ CODES: Final[Mapping[str, Code]] = {
     "inertia_impossible": Code(_REJECT, "no body has the principal moments of inertia {principal_gm2:.2f} g·m² (sigma "
         "{sigma_gm2:.2g} g·m²)", "check that the poses are those of the flange, then the axes and units of wrench and "
         "poses, then the clock"),
-    "height_impossible": Code(_REJECT, "according to the motion, the sensor is {height_mm:~sigma_mm} above the flange "
-        "(sigma {sigma_mm:~sigma_mm}), which is impossible", "check that the poses are those of the flange, then the "
-        "axes and units of wrench and poses, then the clock"),
+    "height_impossible": Code(_REJECT, "the motion places the sensor {height_mm:~sigma_mm} above the flange (sigma "
+        "{sigma_mm:~sigma_mm}), which is impossible", "check that the poses are those of the flange, then the axes and "
+        "units of wrench and poses, then the clock"),
     "motion_coarse": Code(_LIMIT, "poses differ by {off_deg:.2g} from their interpolated neighbours, so only samples "
         "at rest are used ({share_percent:.0f})", "record poses and wrench at 50 Hz or more, with the time "
         "of each sample"),
@@ -413,8 +412,8 @@ CODES: Final[Mapping[str, Code]] = {
         "check that the times of both files have the same meaning"),
     "positions_missing": Code(_LIMIT, "positions are missing, so only slow motion is used ({share_percent:.0f}), with "
         "errors of up to {force_N:.2g}", "give the position of the flange too"),
-    "height_differs": Code(_LIMIT, "according to the motion, the sensor is {height_mm:~sigma_mm} above the flange "
-        "(sigma {sigma_mm:~sigma_mm}), not {configured_mm:.3g}", "correct [sensor] height_mm, or check the positions"),
+    "height_differs": Code(_LIMIT, "the motion places the sensor {height_mm:~sigma_mm} above the flange (sigma "
+        "{sigma_mm:~sigma_mm}), not {configured_mm:.3g}", "correct [sensor] height_mm, or check the positions"),
     "mostly_contact": Code(_LIMIT, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
         "{force_N:.2g}", "keep the tool free for most of the recording"),
     "contacts_left_out": Code(_NOTE, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
@@ -426,9 +425,9 @@ CODES: Final[Mapping[str, Code]] = {
         "{residual_N:.2g}, with the gain estimated {free_N:.2g})", "solve with method ml"),
     "force_error": Code(_REJECT_OR_LIMIT, "the force error is {share_percent:.1f} of the weight ({error_N:.2g}, "
         "{source}), limit {limit_percent:g}", "check cables, contact and orientations, and take more poses"),
-    "torque_error": Code(_REJECT_OR_LIMIT, "the torque error is {share_percent:.1f} of the weight at a lever of "
-        "{lever_m:.2g} ({error_Nm:.2g}, {source}), limit {limit_percent:g}",
-        "check cables, contact and orientations, and take more poses"),
+    "torque_error": Code(_REJECT_OR_LIMIT, "the torque error is {share_percent:.1f} of the weight times {lever_m:.2g} "
+        "({error_Nm:.2g}, {source}), limit {limit_percent:g}", "check cables, contact and orientations, and take more "
+        "poses"),
     "known_values_misfit_force": Code(_LIMIT, "method ml without known values fits the forces to within {free_N:.2g} "
         "instead of {residual_N:.2g}", "check the known values and what the method assumes, or take more poses"),
     "known_values_misfit_torque": Code(_LIMIT, "method ml without known values fits the torques to within "

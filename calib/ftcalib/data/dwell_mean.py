@@ -152,7 +152,7 @@ def noise_level(wrench: Array, window: int) -> Array:
     """
     wrench = _require_samples(wrench)
     if not LEAST_SAMPLES <= window <= len(wrench):
-        raise BadDataset(f"{len(wrench)} samples cannot have a window of {window}: choose 20 to {len(wrench)}.")
+        raise BadDataset(f"a window of {window} does not fit a record of {len(wrench)}: choose 20 to {len(wrench)}.")
     windows = wrench[: len(wrench) // window * window].reshape(-1, window, 6)
     return np.asarray(np.median(windows.std(axis=1, ddof=1), axis=0))
 

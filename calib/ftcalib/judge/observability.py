@@ -111,8 +111,8 @@ def require_orientations(R_base_flange: Array, least: int = LEAST_POSES) -> None
     n, different = len(R_base_flange), different_orientations(R_base_flange)
     if n < least:
         raise NotObservable(
-            f"{n} {'pose is' if n == 1 else 'poses are'} too few, at least {least} are needed: add {least - n}, better "
-            f"{max(RECOMMENDED_POSES, least) - n}."
+            f"{n} {'pose is' if n == 1 else 'poses are'} too few, at least {least} are needed: add {least - n}, or "
+            f"better {max(RECOMMENDED_POSES, least) - n}."
         )
     if different == 1:
         raise NotObservable(f"all {n} poses have the same orientation: turn and tilt the tool between poses.")

@@ -237,4 +237,4 @@ def refuse_saturated(name: str, gauges: NDArray[np.int32]) -> None:
     saturated = np.flatnonzero(((gauges == _LOWEST) | (gauges == _HIGHEST)).any(axis=0))
     if len(saturated):
         names = ", ".join(f"G{gauge}" for gauge in saturated)
-        raise DeviceFault(f"{name}: gauge {names} is at the end of its range", "take the load off, check the cable")
+        raise DeviceFault(f"{name}: gauge {names} is at the end of its range", "remove the load and check the cable")

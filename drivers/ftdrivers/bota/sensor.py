@@ -215,7 +215,7 @@ class BotaSensor(StreamingSensor):
             found = f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}"
             if status & codec.RAW:
                 raise DeviceFault(f"{found}, samples are not in N", "add ?sinc=512 to its address")
-            raise DeviceFault(found, "take the load off, check the cable")
+            raise DeviceFault(found, "remove the load and check the cable")
         if new := status & ~self._seen_status:
             log.warning("%s: status %s; measurement continues", self.name, describe_status(new, codec.STATUS_BITS))
             self._seen_status |= new

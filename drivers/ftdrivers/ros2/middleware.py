@@ -198,7 +198,7 @@ def clock_diagnosis(ros: Node, newest_s: float) -> Diagnosis:
     if -_SAME_CLOCK_MS < behind_ms < _LONGEST_WAY_MS:
         return Diagnosis("clock", True, f"the newest stamp is {behind_ms:.1f} ms old by the clock of this computer")
     where = f"{behind_ms:.0f} ms behind" if behind_ms > 0 else f"{-behind_ms:.0f} ms ahead of"
-    found = f"another clock: the stamps are {where} that of this computer; the delay is estimated from motion"
+    found = f"the stamps come from another clock, {where} that of this computer; the delay is estimated from motion"
     return Diagnosis("clock", True, found)
 
 

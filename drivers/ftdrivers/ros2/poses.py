@@ -268,5 +268,5 @@ class Transforms:
             if frame in self._parts and frame != self._base:
                 frame = self._parts[frame][0]
         if frame != self._base:
-            return f"tf does not connect {self._base} with {self._flange}: nothing is above {frame}"
-        return f"no transform between {self._base} and {self._flange} moves, so none has a time"
+            return f"tf does not connect {self._base} with {self._flange}: {frame} has no parent"
+        return f"all transforms between {self._base} and {self._flange} are static, so none has a time"

@@ -252,7 +252,7 @@ class Opening:
             if self.clock.now_s() > deadline_s:
                 program = self.reader.reported_program()
                 raise ConnectError(
-                    f"another program is on {self.host}{f' ({program})' if program else ''}, and is not stopped "
+                    f"another program is active on {self.host}{f' ({program})' if program else ''} and is not stopped "
                     "automatically",
                     "stop it on the pendant, then start again",
                 )

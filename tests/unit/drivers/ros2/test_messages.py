@@ -120,8 +120,8 @@ BAD_MESSAGES: list[tuple[str, Callable[[], object]]] = [
     ("quaternion of norm 0.5", lambda: list(Poses("/p").read("/p", pose(q=(0, 0, 0, 0.5))))),
     ("quaternion of norm 0", lambda: list(Poses("/p").read("/p", pose(q=(0, 0, 0, 0))))),
     ("tf has no frame 'flange'", lambda: _read_tf(("/tf", tf((5.0, "base", "arm"))))),
-    ("nothing is above arm", lambda: _read_tf(("/tf", tf((5.0, "arm", "flange"), (5.0, "base", "other"))))),
-    ("moves, so none has a time", lambda: _read_tf(("/tf_static", tf((0.0, "base", "flange"))))),
+    ("arm has no parent", lambda: _read_tf(("/tf", tf((5.0, "arm", "flange"), (5.0, "base", "other"))))),
+    ("are static, so none has a time", lambda: _read_tf(("/tf_static", tf((0.0, "base", "flange"))))),
     ("stamp 0", lambda: _read_tf(("/tf", tf((0.0, "base", "flange"))))),
     (
         "are 0.50 s apart",

@@ -256,7 +256,7 @@ CASES: list[tuple[str, dict[str, Any], str | None, str | None, Any]] = [
     ("no topic of geometry_msgs/msg/WrenchStamped", {"topics": ("/pose",)}, None, None, None),
     ("tf has no frame 'tool1'", {"topics": TF}, None, "tf?base=base&flange=tool1", None),
     ("does not connect base with camera", {"topics": TF}, None, "tf?base=base&flange=camera", None),
-    ("moves, so none has a time", {"topics": TF}, None, "tf?base=half&flange=flange", None),
+    ("are static, so none has a time", {"topics": TF}, None, "tf?base=half&flange=flange", None),
     ("tf needs base and flange", {"topics": TF}, None, "tf?base=base", None),
     ("the bag has no topic /tf", {}, None, "tf?base=base&flange=flange", None),
     ("is not a URDF", {"topics": ("/ft", "/joints")}, None, "/joints?urdf=none.urdf&flange=f", None),

@@ -196,7 +196,7 @@ def test_a_calibration_of_other_devices_is_refused(cell: Cell, devices: Any, say
 
 def test_a_rejected_calibration_is_refused(cell: Cell) -> None:
     rejected = Finding.of("second_solution", probability_percent=40.0)
-    with pytest.raises(NotAccepted, match=r"rejected \(a very different mounting explains"):
+    with pytest.raises(NotAccepted, match=r"rejected \(a very different mounting \(probability 40 %\) explains"):
         cell.propose(cell.result(findings=(rejected,)))
 
 

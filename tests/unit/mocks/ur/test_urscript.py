@@ -125,7 +125,7 @@ def test_run_time_errors_say_what_is_wrong_and_where(body: str, place: tuple[int
         ("def f():\n  x = 1 ! 2\nend\n", (2, 9), "'! 2' is not URScript"),
         ("def f():\n  1 + 2\nend\n", (3, 1), "an assignment or a call expected"),
         ("def f(x):\nend\n", (1, 1), "a program has no parameters"),
-        ("def f():\n  sleep(a=1, 2)\nend\n", (2, 14), "an argument with a name expected"),
+        ("def f():\n  sleep(a=1, 2)\nend\n", (2, 14), "a named argument expected after"),
         ("def f():\n  end = 1\nend\n", (2, 7), "the end of the line expected"),
         ("def f():\nend\nx = 1\n", (3, 1), "nothing more expected"),
         ("def f():\n  x = 'single'\nend\n", (2, 7), "is not URScript"),
