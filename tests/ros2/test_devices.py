@@ -170,7 +170,7 @@ def test_tf_without_its_messages_is_one_sentence() -> None:
     if find_spec("tf2_msgs"):
         pytest.skip("a sourced ROS has tf2_msgs")
     arm = Ros2Arm("ros2:tf?base=base&flange=tool0")
-    with closing(arm), pytest.raises(NoRos2, match=r"cannot import tf2_msgs .*source a ROS 2"):
+    with closing(arm), pytest.raises(NoRos2, match=r"cannot import tf2_msgs .*source ROS 2"):
         arm.open()
 
 

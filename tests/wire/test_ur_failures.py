@@ -152,7 +152,7 @@ EVENTS = [
     Event(
         "program-pause", lambda s: s.dashboard("pause"), nothing, DeviceFault, "stopped or paused", hits_opening=False
     ),
-    Event("crash-script", on("crash-script"), nothing, DeviceFault, "ended .* by itself|in line", hits_opening=False),
+    Event("crash-script", on("crash-script"), nothing, DeviceFault, "ended by itself|in line", hits_opening=False),
     Event(
         "foreign-program",
         another_takes_over,
