@@ -148,7 +148,7 @@ EVENTS = [
     ),
     Event("power-off", lambda s: s.dashboard("power off"), power_up, DeviceFault, "power the arm on"),
     Event("brakes", on("mode", robot=5), on("mode", robot=7), DeviceFault, r"\(idle\); release its brakes"),
-    Event("program-stop", on("dashboard-stop"), nothing, DeviceFault, "or stopped from outside", hits_opening=False),
+    Event("program-stop", on("dashboard-stop"), nothing, DeviceFault, "was stopped from outside", hits_opening=False),
     Event(
         "program-pause", lambda s: s.dashboard("pause"), nothing, DeviceFault, "stopped or paused", hits_opening=False
     ),
@@ -484,7 +484,7 @@ def test_a_program_of_another_client_is_never_ended_for_a_start(station: Station
         station.wait_for(lambda state: state["runtime_state"] == "PAUSED")
     before = len(station.ask("state")["events"])
     error = refused(station)
-    assert re.search(r"\((PLAYING|PAUSED) .*\), and is not stopped", error.found)
+    assert re.search(r"\((PLAYING|PAUSED) .*\) and is not stopped", error.found)
     assert "stop it on the pendant" in error.fix
     state = station.ask("state", since=before)
     assert not [event for event in state["events"] if event["by"] in ("script port", "program")]

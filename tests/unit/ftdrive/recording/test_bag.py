@@ -260,7 +260,7 @@ CASES: list[tuple[str, dict[str, Any], str | None, str | None, Any]] = [
     ("tf needs base and flange", {"topics": TF}, None, "tf?base=base", None),
     ("the bag has no topic /tf", {}, None, "tf?base=base&flange=flange", None),
     ("is not a URDF", {"topics": ("/ft", "/joints")}, None, "/joints?urdf=none.urdf&flange=f", None),
-    ("go with tf or urdf", {}, None, "/pose?base=base", None),
+    ("apply only to tf and urdf", {}, None, "/pose?base=base", None),
     ("cannot be read", {}, None, None, cut),
     ("cannot be read", {}, None, None, forget),
     ("no topic of geometry_msgs/msg/WrenchStamped", {}, None, None, retype),
