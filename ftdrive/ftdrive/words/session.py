@@ -304,7 +304,7 @@ def settings_in_words(settings: ControllerSettings | None) -> str:
 def _lean_text(push: Push) -> str:
     up = push.old.up_base_m_s2
     if up is None:
-        return f"The base {push.lean} relative to [workcell] mounting; the controller does not report its gravity."
+        return f"The base {push.lean}, relative to [workcell] mounting; the controller does not report its gravity."
     off_deg = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
     setting = "level" if off_deg < _LEVEL_DEG else f"{_format_vector(up, '.3f')} m/s²"
     advice = (
