@@ -479,7 +479,7 @@ def solve_load_runs(
     identity, data = read[0][1:]
     if other := next((one for _, one, _ in read if one != identity), None):
         name, ours = next((name, value) for name, value in identity.items() if other[name] != value)
-        raise ConfigError(f"the runs are of different sensors ({name} {ours} and {other[name]}): give those of one")
+        raise ConfigError(f"the runs are of different sensors ({name} {ours} and {other[name]}): give runs of one")
     of_cells = (one.setup.weighed_kg for _, _, one in read if one.setup.weighed_kg is not None)
     weighed = next(of_cells, None) if tool_mass is None else mass_of(tool_mass)
     prior = _prior_matrix(data, identity, [path.name for path in paths], say)

@@ -91,9 +91,9 @@ def _is_rows(value: Any) -> bool:
 
 _TYPES: Mapping[Any, tuple[str, Callable[[Any], bool]]] = {
     str: ("a string: put it in quotes", lambda value: isinstance(value, str)),
-    float: ("a number: give one such as 1.5, without quotes and unit", is_number),
+    float: ("a number: give one such as 1.5, without quotes or unit", is_number),
     int: (
-        "a whole number: give one such as 1, without quotes and decimal point",
+        "a whole number: give one such as 1, without quotes or decimal point",
         lambda value: isinstance(value, int) and not isinstance(value, bool),
     ),
     bool: ("true or false: give one of them, without quotes", lambda value: isinstance(value, bool)),
@@ -109,10 +109,10 @@ def _unless(fits: Callable[[Any], bool], fix: str) -> Reject:
     return lambda value: None if fits(value) else fix
 
 
-reject_empty = _unless(lambda text: bool(text.strip()), "it is empty: give a value, or leave the key out")
+reject_empty = _unless(lambda text: bool(text.strip()), "it is empty; give a value, or leave the key out")
 reject_sign = _unless({-1, 1}.__contains__, "give 1, or -1 for a sensor that reports the reaction")
 reject_height = _unless(lambda mm: not 0 < mm < 1, "the unit is mm: give the height in mm, such as 33, or 0")
-reject_store = _unless(lambda url: "://" in url, "it is not an address: give one such as sqlite:////data/store.sqlite")
+reject_store = _unless(lambda url: "://" in url, "it is not an address; give one such as sqlite:////data/store.sqlite")
 reject_control = _unless(CONTROL_SETTINGS.__contains__, f"give one of {', '.join(CONTROL_SETTINGS)}")
 reject_record = _unless(lambda s: s == 0 or s >= 3, "give 3 or more, or 0 for none: a shorter record is useless")
 
@@ -136,7 +136,7 @@ def reject_mounting(value: str) -> str | None:
         usable = value in {"floor", "wall", "ceiling"} or abs(float(value)) <= 180
     except ValueError:
         usable = False
-    return None if usable else "give floor, wall, ceiling, or the lean of the base towards -x, -180 to 180 degrees"
+    return None if usable else "give floor, wall, ceiling, or the tilt of the base towards -x, -180 to 180 degrees"
 
 
 def reject_cylinders(rows: Sequence[Sequence[float]]) -> str | None:

@@ -79,7 +79,7 @@ class _SafetyQuestions:
             *(() if self._load is None else self._load.questions),
             "Is the tool free: no contact, no workpiece, no fluid, cables slack? Is the base bolted?",
             f"Is the space {self._plan.ball_in_words()} (the wrist){room} free of obstacles and people?",
-            "Is the emergency stop in reach, and tested?",
+            "Is the emergency stop within reach, and tested?",
         ):
             self._journal.require(text, assumed=assumed)
         self.ask_reduced(assumed=assumed)

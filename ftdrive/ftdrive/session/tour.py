@@ -45,7 +45,7 @@ def take_tour(session: OpenSession) -> Run | None:
         tour = Tour(guarded, driven, quiet_std, book, options)
         tour.run(along.todo)
     missing = "poses are missing" if len(book.run.stops()) <= len(driven.plan.steps) else ""
-    along.judge_completed(f"moves replaced: from {_list_poses(tour.undriven)} on" if tour.undriven else missing)
+    along.judge_completed(f"moves from {_list_poses(tour.undriven)} were replaced" if tour.undriven else missing)
     return book.run
 
 
@@ -160,7 +160,7 @@ class Tour:
         turn_rad = np.abs(self._nodes[index] - self._arm.state().q_rad)
         moving = [str(joint + 1) for joint in np.flatnonzero(turn_rad > AT_RAD)]
         if not moving:
-            return "the arm stands there, Enter starts the measurement"
+            return "the arm is already there, Enter starts the measurement"
         joints = f"joint{'s' if len(moving) > 1 else ''} {', '.join(moving)}"
         largest = f"largest turn {np.degrees(turn_rad.max()):.0f}°"
         speed_rad_s = self._own_speed(index)

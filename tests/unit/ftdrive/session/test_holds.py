@@ -15,7 +15,7 @@ from tests.unit.ftdrive.session.scenarios import (
     status,
 )
 
-QUESTIONS = ("Is the tool free", "Is the space within", "Is the emergency stop in reach")
+QUESTIONS = ("Is the tool free", "Is the space within", "Is the emergency stop within reach")
 PAUSE = {"move 4": press(Key.PAUSE)}
 PAUSED = (4, "paused by the operator")
 UNCONFIRMED = (4, "not confirmed: Approach")
