@@ -102,7 +102,7 @@ def init(output: Path, simulate: bool, yes: bool, view: ViewOptions, as_json: bo
             form.run()
         cell = described.cell()
         write_new(output, described.file())
-        words, end = ". Measure tool, planes and boxes, then set measured = true in it: before that, nothing moves.", ""
+        words, end = ". Measure tool, planes and boxes, then set measured = true in it: until then, nothing moves.", ""
         if simulate:
             words, end = " for an emulated cell: commands with --simulate use it, all others refuse it.", " --simulate"
         if page is not None:

@@ -322,7 +322,7 @@ def _at_pan(q_rad: Array, numbers: Sequence[int]) -> Array:
 
 def _chosen_words(chosen: Chosen) -> list[str]:
     lost = chosen.force_rms_N / chosen.ideal_force_rms_N
-    words = [f"Their predicted error is {lost:.2f} times that of the best poses without limits of reach."]
+    words = [f"Their predicted error is {lost:.2f} times that of the best poses without reach limits."]
     return [*words, _elsewhere_words(chosen.q_rad[0])] if chosen.elsewhere else words
 
 

@@ -517,7 +517,7 @@ def by_safety(status: ArmStatus, words: str) -> Tripped:
     mode = status.safety_mode
     if mode == "protective stop":
         payload = "" if status.payload_kg is None else f" (payload set: {status.payload_kg:.2f} kg)"
-        words += f"; usual causes are contact, or a wrong payload or centre of mass in the controller{payload}"
+        words += f"; usual causes are contact and, in the controller, a wrong payload or centre of mass{payload}"
         return fault(Hazard.PROTECTIVE_STOP, words)
     stopped = any(word in mode for word in ("emergency", "safeguard", "enabling"))
     return Tripped(Hazard.EMERGENCY_STOP if stopped else Hazard.SAFETY_MODE, DeviceFault(words))

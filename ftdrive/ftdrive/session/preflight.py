@@ -173,7 +173,7 @@ def _check_approach(before: Before) -> Check:
     if not approach.certified:
         return Check("approach", "failed", "the approach to the first pose is not proven clear", "jog the arm near it")
     if not len(approach.q_rad):
-        return Check("approach", "ok", "the arm stands at the first pose")
+        return Check("approach", "ok", "the arm is at the first pose")
     nearest_mm = 1e3 * approach.clearance_m
     return Check("approach", "ok", f"moves: {len(approach.q_rad)}, proven clear, clearance {nearest_mm:.0f} mm")
 
@@ -184,7 +184,7 @@ def check_cable(before: Before) -> Check:
     turns = [step.q_rad[5] for step in before.plan.steps]  # an approach stays between these angles
     low, high = min(turns), max(turns)
     now, least, most = np.degrees([stands, low, high])
-    found = f"wrist 3 stands at {now:.0f}° and turns between {least:.0f}° and {most:.0f}°"
+    found = f"wrist 3 is at {now:.0f}° and turns between {least:.0f}° and {most:.0f}°"
     inside = low - _ROUNDED_RAD <= stands <= high + _ROUNDED_RAD
     has_been_there = (before.known or before.resumed) and inside
     if has_been_there or max(high - stands, stands - low) <= WRIST_6_RAD + _ROUNDED_RAD:

@@ -73,7 +73,7 @@ class Tour:
         self._nodes, self._now = self._drive.nodes_rad, self._drive.now
         self._quiet_std, self._book, self._options = quiet_std, book, options
         self._certifier = driven.certifier
-        # A load is hung on its string only when the arm stands at the first pose.
+        # A load is hung on its string only when the arm is at the first pose.
         self._to_hang = self._certifier.arm.hung is not None
         self._drive.certifier = self._certifier.without_load
 
@@ -243,7 +243,7 @@ class Tour:
             return
         if at is None or speed_rad_s is None:
             if self._drive.approach(index, stop) and stop == 1 and not self._to_hang:
-                words = f"The arm stands at the first pose. The tour has {self._now.stops} stops. Begin?"
+                words = f"The arm is at the first pose. The tour has {self._now.stops} stops. Begin?"
                 self._drive.confirm(words)
         else:
             self._drive.show_state(State.MOVE, stop)

@@ -19,7 +19,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "report": "Write a report of a calibration: verdict, findings, figures.",
     "live": "Show the raw and the compensated wrench.",
     "weigh": "Weigh what the gripper holds, in half a second.",
-    "loads": "Check the sensor by a known weight, or correct its matrix by several.",
+    "loads": "Check the sensor with a known weight, or correct its matrix with several.",
     "push": "Set payload or gravity in the controller as calibrated.",
     "record": "Record raw and compensated wrench with pose and events.",
     "history": "List results and verifications, with their trends.",

@@ -66,7 +66,7 @@ A_PERSON_SAYS_NO = {
         holds=((4, "unexpected contact"), (4, "not confirmed: Approach back")),
     ),
     "a tour that may not begin yet is held at its first pose": Case(
-        {}, ("resume",), {"Begin?": ("no",)}, holds=((1, "not confirmed: The arm stands"),)
+        {}, ("resume",), {"Begin?": ("no",)}, holds=((1, "not confirmed: The arm is at"),)
     ),
     **{
         f"a no to {words!r} before the first motion ends the session": Case(

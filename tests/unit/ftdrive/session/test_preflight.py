@@ -88,7 +88,7 @@ def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path
     lab.arm.q[5] = np.radians(-90)
     made_there = tmp_path / "there.json"
     assert lab.take_poses(dry_run=True, output=made_there) is None
-    assert "wrist 3 stands at -90°" in next(e.words for e in lab.operator.of(Checked) if e.name == "cable")
+    assert "wrist 3 is at -90°" in next(e.words for e in lab.operator.of(Checked) if e.name == "cable")
     lab.arm.q[5] = np.radians(160)
     lab.operator.shown.clear()
     refuse_plan = pytest.raises(NotAccepted, match=r"160°.* -?\d+° and -?\d+°")
@@ -101,7 +101,7 @@ def test_a_plan_that_has_run_before_does_not_excuse_a_wound_cable(lab: Lab) -> N
     lab.take_poses()
     lab.arm.q[5] -= 2 * np.pi
     lab.operator.shown.clear()
-    with pytest.raises(NotAccepted, match="wrist 3 stands at"):
+    with pytest.raises(NotAccepted, match="wrist 3 is at"):
         lab.take_poses(plan=lab.run().folder / "plan.json")
 
 

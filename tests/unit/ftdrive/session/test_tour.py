@@ -179,7 +179,7 @@ def test_a_skipped_pose_counts_against_the_plan_though_resume_takes_it(lab: Lab)
     lab.operator.answers["Pose 3 of 7"] = ["s"]
     lab.take_poses(mode="step")
     assert "slow again" in lab.said()
-    assert "from poses 2 and 3 on" in lab.said()
+    assert "moves from poses 2 and 3 were replaced" in lab.said()
     lab.operator.shown.clear()
     lab.take_poses(resume=lab.run().folder, mode="auto")
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
