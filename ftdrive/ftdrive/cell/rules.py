@@ -149,7 +149,7 @@ def reject_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
             )
         if min(row[1] - row[0], row[2]) < _THINNEST_MM:
             return (
-                f"{list(row)} is shorter or thinner than {_THINNEST_MM:g} mm: give from, to and diameter in mm, and "
+                f"{list(row)} is shorter or thinner than {_THINNEST_MM:g} mm: give from, to and diameter in mm; use "
                 f"{_THINNEST_MM:g} mm for a thinner part"
             )
     return None
@@ -172,7 +172,7 @@ def reject_boxes(rows: Sequence[Sequence[float]]) -> str | None:
             return f"{list(row)} is not a box: give two opposite corners [x, y, z, x, y, z] in mm"
         if min(abs(row[i] - row[i + 3]) for i in range(3)) < _THINNEST_MM:
             return (
-                f"{list(row)} is thinner than {_THINNEST_MM:g} mm: give two opposite corners in mm, and "
+                f"{list(row)} is thinner than {_THINNEST_MM:g} mm: give two opposite corners in mm; use "
                 f"{_THINNEST_MM:g} mm for a thinner box"
             )
     return None

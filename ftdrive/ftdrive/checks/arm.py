@@ -110,7 +110,7 @@ def check_program(status: ArmStatus) -> Check:
 def check_speed(status: ArmStatus) -> Check:
     """Check that the speed slider is high enough."""
     found = (
-        f"speed slider at {100 * status.speed_slider:.0f} %, the controller allows {100 * status.speed_scaling:.0f} %"
+        f"speed slider at {100 * status.speed_slider:.0f} %; the controller allows {100 * status.speed_scaling:.0f} %"
     )
     if status.speed_slider < SLOWEST_SLIDER:
         fix = "raise the speed slider on the pendant, to 100 % if that is safe; ftdrive never changes it"

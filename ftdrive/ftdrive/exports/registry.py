@@ -153,8 +153,8 @@ class _Values:
         """Position (3,) of the sensor's origin in the flange."""
         if self.settings.height_mm is None:
             raise ConfigError(
-                f"{self.target} needs the height of the sensor's origin above the flange face, which gravity cannot "
-                "show: give --height MM, or set [sensor] height_mm before the next calibration"
+                f"{self.target} needs the height of the sensor's origin above the flange face, which gravity does not "
+                "determine: give --height MM, or set [sensor] height_mm before the next calibration"
             )
         return sensor_origin_m(self.settings.height_mm)
 

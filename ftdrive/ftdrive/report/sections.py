@@ -93,7 +93,7 @@ def estimates_section(facts: Facts) -> Section:
     text = [
         f"Method {result['method']}, {result['n_poses']} {taken}, gravity {result['g_m_s2']:g} m/s². Wrenches act on "
         "the sensor, in its axes, about its origin. Centre of mass and biases are in sensor axes.",
-        f"Strongest correlations: {pairs}." if pairs else "No two parameters are correlated by more than 0.7.",
+        f"Strongest correlations: {pairs}." if pairs else "No two parameters have a correlation above 0.7.",
     ]
     figure = Figure(
         "correlation",
@@ -289,9 +289,7 @@ def drift(facts: Facts) -> Section:
     if again is not None:
         text.append(f"{capitalized(again['words'])}.")
     if seen["lag1"] is not None:
-        text.append(
-            f"Residuals of successive poses are correlated by {seen['lag1']:.2f}. Good: near 0. Drift increases it."
-        )
+        text.append(f"Correlation of successive residuals: {seen['lag1']:.2f}. Good: near 0. Drift increases it.")
     tables = tuple[ReportTable, ...]()
     if found is None:
         text.append("The fit found no drift of the bias.")
