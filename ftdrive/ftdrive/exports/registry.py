@@ -62,7 +62,7 @@ class Settings:
     sensor_mass_kg: float | None = None
     """Mass of sensor and adapter, kg."""
     sensor_com_mm: tuple[float, ...] | None = None
-    """Centre of mass of sensor and adapter from the flange, flange axes, mm; None: half way up on the flange axis."""
+    """Centre of mass of sensor and adapter from the flange, flange axes, mm; None: halfway up on the flange axis."""
     verification: VerificationRecord | None = None
     """Last verification of the calibration; None if there is none."""
 
