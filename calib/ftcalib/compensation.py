@@ -147,7 +147,7 @@ class Compensator:
         wrench, R_base_flange = np.asarray(wrench, self.dtype), np.asarray(R_base_flange, self.dtype)
         _check_shapes(wrench, R_base_flange)
         if wrench.ndim != 2:
-            raise ValueError(f"wrench has shape {wrench.shape}, expected (n, 6): use sample for one.")
+            raise ValueError(f"wrench has shape {wrench.shape}, expected (n, 6): use `sample` for a single wrench.")
         if out is not None and (out.shape != wrench.shape or out.dtype != self.dtype):
             raise ValueError(f"out is {out.dtype} {out.shape}, expected {self.dtype} {wrench.shape}")
         contact = np.empty_like(wrench) if out is None else out

@@ -110,8 +110,8 @@ def read_file(path: str | Path) -> bytes:
     with open_file(path) as file:
         if (size := os.fstat(file.fileno()).st_size) > MOST_BYTES:
             raise OSError(
-                f"{path} has {size / 1e6:.0f} MB, the limit is {MOST_BYTES / 1e6:.0f} MB: check that it is the right "
-                "file"
+                f"{path} has {size / 1e6:.0f} MB, and the limit is {MOST_BYTES / 1e6:.0f} MB: check that it is the "
+                "right file"
             )
         return file.read(MOST_BYTES)
 
@@ -185,8 +185,8 @@ def object_of(content: bytes, error: type[Exception], *, accept_changed: bool = 
         raise error(f"the file contains a JSON {type(document).__name__}, not an object: is it the right file?")
     if not accept_changed and is_changed(document):
         raise error(
-            "the content differs from its checksum, so the file is damaged or was edited: take it from a copy. If you "
-            "edited it yourself, delete its field 'checksum'."
+            "the content differs from its checksum, so the file is damaged or was edited: restore it from a copy. If "
+            "you edited it yourself, delete its field 'checksum'."
         )
     return document
 

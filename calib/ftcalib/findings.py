@@ -225,7 +225,7 @@ def _format_scale(unit_N: Sequence[float] | None) -> str:
     if not unit_N:
         return ""
     unit, sigma = (to_place_of(value, unit_N[1]) for value in unit_N)
-    return f". By the known mass 1 unit = {unit} N (sigma {sigma} N)"
+    return f". According to the known mass, 1 unit = {unit} N (sigma {sigma} N)"
 
 
 # Formats of values that files of earlier versions lack.
@@ -259,27 +259,27 @@ _LIMIT_OR_NOTE: Final = ("limit", "note")
 CODES: Final[Mapping[str, Code]] = {
     # Data that cannot be right
     "other_recording": Code(_REJECT, "{left_percent:.0f} of the variation of the wrench does not follow the poses",
-        "keep the tool free of contact, check the form of the rotations, and check that wrench and poses are from one "
-        "recording on one clock"),
+        "keep the tool free of contact, check the format of the rotations, and check that wrench and poses come from "
+        "one recording and one clock"),
     "stuck_channels": Code(_REJECT, "the reading of {channels} is the same in all poses",
         "check the sensor for a channel that is stuck"),
     "quantised": Code(_LIMIT, "the readings come in steps of {step_N:.2g} and {step_Nm:.2g}",
         "record the full resolution of the sensor, and the mean of many samples at each pose"),
-    "saturated": Code(_REJECT, "{channel} reads exactly the same extreme in {poses:poses}, as if it were saturated",
-        "use a larger measuring range or a lighter tool, and repeat these poses"),
+    "saturated": Code(_REJECT, "{channel} reads exactly the same extreme value in {poses:poses}, as if it were "
+        "saturated", "use a larger measuring range or a lighter tool, and repeat these poses"),
     "repeated_poses": Code(_REJECT, "{poses:poses} have identical wrenches and orientations", "keep one of the copies"),
     "repeated_wrenches": Code(_REJECT, "{poses:poses} have identical wrenches in different orientations",
         "repeat these poses"),
     "constant_force": Code(_REJECT, "the force is {force_N:.2g} in all poses, as if the wrench were given in base axes",
         "add --wrench-frame base, or record it in the axes of the sensor"),
     "wrench_in_base": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} with the wrench in base "
-        "axes", "add --wrench-frame base, with --tcp if it is about the TCP, or record it in the axes of the sensor"),
+        "axes", "add --wrench-frame base, with --tcp if the torques are about the TCP, or record it in sensor axes"),
     "orientations_inverted": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} with the "
-        "orientations inverted", "state that they map base to flange (--orientation R_flange_base)"
-        "{also:?, or read them as |}{also}"),
+        "orientations inverted", "state that the orientations map base to flange (--orientation R_flange_base){also:?, "
+        "or read them as |}{also}"),
     "quaternion_order": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} with quaternions "
-        "({order}) instead of ({read_as})", 'exchange their columns (--columns "qx=NAME,...")'
-        "{also:?, or read them as |}{also}"),
+        "({order}) instead of ({read_as})", 'exchange the quaternion columns (--columns "qx=NAME,..."){also:?, or read '
+        "them as |}{also}"),
     "euler_angles": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} with Euler angles {order} "
         "instead of {read_as}", "add --euler {order} for a file of angles, or compute the rotations in this "
         "order{also:?, or read them as |}{also}"),
@@ -290,87 +290,85 @@ CODES: Final[Mapping[str, Code]] = {
     "zeroed_each_pose": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} if the sensor was "
         "zeroed at each pose", "zero the sensor at most once, before the first pose, and record again"),
     "pairing_or_rotations": Code(_REJECT, "the norm of the forces fits a weight of {weight_N:.3g} within "
-        "{radial_N:.2g}, but their direction only within {residual_N:.2g}", "check the pairing of wrenches and "
-        "poses, Euler angles (--euler), degrees, and the order of the rotations"),
+        "{radial_N:.2g}, but their direction only within {residual_N:.2g}", "check the pairing of wrenches and poses, "
+        "the Euler angles (--euler), the unit of the angles, and the order of the rotations"),
     "orientations_off": Code(_REJECT_OR_LIMIT, "orientations are off by {turn_deg:.1f}: forces fit within "
-        "{radial_N:.2g} in norm, {residual_N:.2g} in direction",
-        "fasten base, sensor and tool, give the measured poses rather than the planned ones, and check the arm's "
-        "model"),
+        "{radial_N:.2g} in norm, {residual_N:.2g} in direction", "fasten base, sensor and tool, give the measured "
+        "poses rather than the planned ones, and check the arm's model"),
     "torques_unrelated": Code(_REJECT_OR_LIMIT, "{left_percent:.0f} of the variation of the torques does not follow "
         "the weight, although the forces do", "check that forces and torques are from one sensor and one recording, "
         "then check for cables and contact"),
-    "axes_disagree": Code(_REJECT, "torque residual {residual_Nm:.2g}, but {corrected_Nm:.2g} with other axes of "
-        "force or torque", "try {corrections:axes} (--columns), or check the wiring of the axes and the sensor's "
-        "matrix"),
+    "axes_disagree": Code(_REJECT, "torque residual {residual_Nm:.2g}, but {corrected_Nm:.2g} with other axes of force "
+        "or torque", "try {corrections:axes} (--columns), or check the wiring of the axes and the sensor's matrix"),
     # Known values that the data contradict
-    "known_mass": Code(_LIMIT_OR_NOTE, "{mass_kg:~sigma_kg} (sigma {sigma_kg:~sigma_kg}) by the data, but "
-        "{known_kg:g} by the known mass", 'scale the forces so (--columns "fx=NAME [.82 N],..." for .82 N), or '
-        "correct the known value (--mass-kg){units:units}{unit_N:scale}"),
-    "known_gravity_direction": Code(_LIMIT_OR_NOTE, "{off_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) between "
-        "gravity by the data and its known direction", "correct the data or the known value (--level-deg, --up)"),
-    "known_mounting": Code(_LIMIT_OR_NOTE, "{off_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) between the mounting "
-        "by the data and the known one", "correct the known value (--mounting-deg), or the data{corrections:?, such "
-        "as |}{corrections:axes}"),
+    "known_mass": Code(_LIMIT_OR_NOTE, "the data give a mass of {mass_kg:~sigma_kg} (sigma {sigma_kg:~sigma_kg}), but "
+        "the known mass is {known_kg:g}", 'scale the forces accordingly (--columns "fx=NAME [.82 N],..." for .82 N), '
+        "or correct the known value (--mass-kg){units:units}{unit_N:scale}"),
+    "known_gravity_direction": Code(_LIMIT_OR_NOTE, "gravity in the data is {off_deg:~sigma_deg} (sigma "
+        "{sigma_deg:~sigma_deg}) off its known direction", "correct the data or the known value (--level-deg, --up)"),
+    "known_mounting": Code(_LIMIT_OR_NOTE, "the mounting in the data is {off_deg:~sigma_deg} (sigma "
+        "{sigma_deg:~sigma_deg}) off the known one", "correct the known value (--mounting-deg), or the "
+        "data{corrections:?, such as |}{corrections:axes}"),
     # Units, drift and changes of one session
     "bias_implausible": Code(_REJECT_OR_LIMIT, "the bias is {force_N:.5g} and {torque_Nm:.5g} for a weight of "
         "{weight_N:.3g}, as with raw counts", "convert the counts to N and N·m with the factors of the sensor. A known "
         "mass shows the factor of the force (--mass-kg){unit_N:scale}"),
     "payload_units": Code(_LIMIT, "the load on the sensor is {load_kg:.2f}, but the payload in the controller implies "
         "{expected_kg:.2f}", "check the units of the sensor{units:units} before you correct the payload"),
-    "com_shifted": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the centre of mass is shifted by {shift_mm:.2g}, as if "
-        "the load had slipped", "fasten the load and calibrate again"),
-    "load_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the weight has changed by {change_N:+.2g} and the "
+    "com_shifted": Code(_REJECT_OR_LIMIT, "from {pose:poses} on, the centre of mass is shifted by {shift_mm:.2g}, as "
+        "if the load had slipped", "fasten the load and calibrate again"),
+    "load_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on, the weight has changed by {change_N:+.2g} and the "
         "centre of mass by {shift_mm:.2g}", "check whether something was lost, picked up or shifted, and calibrate "
         "again"),
     "bias_stepped": Code(_REJECT_OR_LIMIT, "the bias steps at {pose:poses}, by up to {force_N:.2g} and {torque_Nm:.2g}"
         ", as if the sensor was zeroed", "zero it at most once, before the first pose, and calibrate again. If no "
         "program zeroes it, look for a cable that pulls"),
-    "sensor_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
+    "sensor_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on, the sensor is turned by {turn_deg:.2g}",
         "fasten its screws and calibrate again"),
-    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on it looks like another sensor: turned by "
-        "{turn_deg:.2g}, bias changed by {force_N:.2g} and {torque_Nm:.2g}",
-        "calibrate each sensor by itself"),
+    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on, another sensor seems to be in use: turned by "
+        "{turn_deg:.2g}, bias changed by {force_N:.2g} and {torque_Nm:.2g}", "calibrate each sensor by itself"),
     "sensors_alternate": Code(_REJECT, "every other pose looks like another sensor: turned by {turn_deg:.2g}, bias "
         "changed by {force_N:.2g} and {torque_Nm:.2g}", "separate the readings of the sensors"),
     "drift": Code(_LIMIT_OR_NOTE, "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the "
         "last", "let the sensor warm up and calibrate again"),
-    "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty "
-        "of {sigma_N:.2g}", "record the raw wrench if it was compensated, or zeroed at each pose. Otherwise keep the "
-        "tool free of contact, or hang something heavier on the sensor"),
-    "second_solution": Code(_REJECT, "{probability_percent:.2g} probability of a very different mounting, which "
-        "explains the data almost as well", "add poses with another angle between the tool and the vertical"),
+    "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is less than {least_sigmas:g} times its "
+        "uncertainty of {sigma_N:.2g}", "record the raw wrench if it was compensated, or zeroed at each pose. "
+        "Otherwise keep the tool free of contact, or hang something heavier on the sensor"),
+    "second_solution": Code(_REJECT, "a very different mounting (probability {probability_percent:.2g}) explains the "
+        "data almost as well", "add poses with another angle between the tool and the vertical"),
     "torques_about_point": Code(_LIMIT, "the centre of mass is {inside_mm:.0f} behind the sensor, as if torques were "
         "about a point in front of it", "add --wrench-frame tcp --tcp X,Y,Z,RX,RY,RZ, or record the torques about the "
         "sensor"),
     "torques_reversed": Code(_LIMIT, "the centre of mass is {inside_mm:.0f} behind the sensor, as if torques were "
-        "reversed or about the TCP", "push the tip aside. If that gives almost no torque, add --wrench-frame tcp "
-        "--tcp X,Y,Z,RX,RY,RZ. Otherwise reverse the torques, or give the orientations in right-handed axes, unless "
-        "the tool reaches back that far"),
+        "reversed or about the TCP", "push the tool tip sideways. If that gives almost no torque, add --wrench-frame "
+        "tcp --tcp X,Y,Z,RX,RY,RZ. Otherwise reverse the torques, or give the orientations in right-handed axes, "
+        "unless the tool reaches back that far"),
     "weight_compensated": Code(_LIMIT, "the weight is only {weight_N:.2g}, as if it were compensated, or zeroed at "
         "each pose", "record the raw wrench, without compensation, and zero at most once, before the first pose"),
     "weight_implausible": Code(_REJECT_OR_LIMIT, "the weight is {weight_N:.5g}",
         "check the units of force and torque{units:units}, and whether they are raw counts{unit_N:scale}"),
     "com_too_far": Code(_REJECT_OR_LIMIT, "the centre of mass is {distance_m:.2f} from the sensor, farther than "
         "{most_m:g}", "check the units of force and torque{units:units}, and their reference point (--wrench-frame, "
-        "--tcp), or describe the tool if it reaches so far ([tool] cylinders_mm, [workcell] measured = true)"),
+        "--tcp), or describe the tool if it reaches that far ([tool] cylinders_mm, [workcell] measured = true)"),
     "com_too_near": Code(_LIMIT, "the centre of mass is only {distance_mm:.2g} from the sensor, as with forces in mN "
         "or torques in kN·m", "check the units of force and torque"),
     # Directions and signs
     "gravity_off_mounting": Code(_LIMIT, "gravity is {off_deg:.0f} away from the direction of the declared mounting",
         "correct the mounting ([workcell] mounting, --up), here and in the controller, or check the order and the "
         "direction of the rotations{orders:orders}"),
-    "mounting_undeclared": Code(_LIMIT, "gravity is tilted by {off_deg:.0f}, along {direction:.2f} in base, but no "
-        "mounting is declared", "declare the mounting, such as a wall ([workcell] mounting, --up), or check the order "
-        "and the direction of the rotations{orders:orders}"),
-    "weight_upwards": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down)",
+    "mounting_undeclared": Code(_LIMIT, "gravity is tilted by {off_deg:.0f}, along {direction:.2f} in base axes, but "
+        "no mounting is declared", "declare the mounting, such as a wall ([workcell] mounting, --up), or check the "
+        "order and the direction of the rotations{orders:orders}"),
+    "weight_upwards": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from straight down)",
         "add --sign -1 ([sensor] sign = -1) if the sensor reports the reaction, or correct axes that are reversed or "
-        "swapped in forces and torques alike. If the robot hangs so, declare its mounting ([workcell] mounting, --up). "
-        "Otherwise check the order and the direction of the rotations"),
-    "forces_reversed": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down), and the centre of mass is "
-        "behind the sensor", "push the tip aside. If that gives almost no torque, add --sign -1 --wrench-frame tcp "
-        "--tcp X,Y,Z,RX,RY,RZ. Otherwise reverse the forces, or give the orientations in right-handed axes"),
+        "swapped in forces and torques alike. If the robot is mounted that way, declare its mounting ([workcell] "
+        "mounting, --up). Otherwise check the order and the direction of the rotations"),
+    "forces_reversed": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from straight down), and the centre of "
+        "mass is behind the sensor", "push the tool tip sideways. If that gives almost no torque, add --sign -1 "
+        "--wrench-frame tcp --tcp X,Y,Z,RX,RY,RZ. Otherwise reverse the forces, or give the orientations in "
+        "right-handed axes"),
     # The described cell
-    "tool_mass_mismatch": Code(_LIMIT, "the load on the sensor is {load_kg:.3g}, but the described tool has "
+    "tool_mass_mismatch": Code(_LIMIT, "the load on the sensor is {load_kg:.3g}, but the described tool has a mass of "
         "{tool_kg:.3g}", "check the sensor's units{units:units}, the mounted tool, and whether the controller "
         "compensates part of the load, or correct [tool] mass_kg{unit_N:scale}"),
     "payload_mismatch": Code(_LIMIT, "the controller has a payload of {payload_kg:.2f}, but the load on the sensor is "
@@ -381,8 +379,8 @@ CODES: Final[Mapping[str, Code]] = {
         "is {outside_mm:.0f} outside the tool", "check units{units:units}, signs and reference point of the "
         "wrench (--sign, --columns, --wrench-frame), then [tool] cylinders_mm"),
     # Recordings in motion
-    "zeroed": Code(_LIMIT, "the sensor was zeroed within the recording, at {at_s:.2f} from its start",
-        "zero it before the recording only"),
+    "zeroed": Code(_LIMIT, "the sensor was zeroed during the recording, {at_s:.2f} after its start",
+        "zero it only before the recording"),
     "positions_unit": Code(_REJECT, "the positions spread over {spread_m:.3g} and do not match the weight: they look "
         "like {unit}", "give them in m"),
     "wrench_compensated": Code(_REJECT_OR_LIMIT, "the load weighs {weight_N:.2g}, but has the inertia of "
@@ -397,26 +395,24 @@ CODES: Final[Mapping[str, Code]] = {
         "disagree", "reverse the {channels}, or give wrench and orientations in right-handed axes"),
     "poses_of_tcp": Code(_REJECT_OR_LIMIT, "the sensor is at {point_mm:.0f} in the axes of the poses, off the z axis, "
         "as with poses of a TCP", "give the poses of the flange{units:?, or correct the units|}{units:units}"),
-    "torques_about_tcp": Code(_REJECT_OR_LIMIT, "the torques are about {point_mm:.0f} in the axes of the poses, "
-        "beyond the centre of mass", "give the torques about the sensor origin, and the poses of the "
-        "flange"),
+    "torques_about_tcp": Code(_REJECT_OR_LIMIT, "the torques are about {point_mm:.0f} in the axes of the poses, beyond "
+        "the centre of mass", "give the torques about the sensor origin, and the poses of the flange"),
     "inertia_impossible": Code(_REJECT, "no body has the principal moments of inertia {principal_gm2:.2f} g·m² (sigma "
         "{sigma_gm2:.2g} g·m²)", "check that the poses are those of the flange, then the axes and units of wrench and "
         "poses, then the clock"),
-    "height_impossible": Code(_REJECT, "by the motion the sensor is {height_mm:~sigma_mm} above the flange (sigma "
-        "{sigma_mm:~sigma_mm}), which is impossible", "check that the poses are those of the flange, then the "
-        "axes and units of wrench and poses, then the clock"),
-    "motion_coarse": Code(_LIMIT, "poses differ by {off_deg:.2g} from their interpolated neighbours, so only rows at "
-        "rest are used ({share_percent:.0f})", "record poses and wrench at 50 Hz or more, with the time "
+    "height_impossible": Code(_REJECT, "the motion places the sensor {height_mm:~sigma_mm} above the flange (sigma "
+        "{sigma_mm:~sigma_mm}), which is impossible", "check that the poses are those of the flange, then the axes and "
+        "units of wrench and poses, then the clock"),
+    "motion_coarse": Code(_LIMIT, "poses differ by {off_deg:.2g} from their interpolated neighbours, so only samples "
+        "at rest are used ({share_percent:.0f})", "record poses and wrench at 50 Hz or more, with the time "
         "of each sample"),
     "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned by only {range_deg:.0f}: sigma is {mounting_deg:.2g} for "
-        "the mounting, {weight_N:.2g} for the weight",
-        "turn wrist 2 and wrist 3 by 60° or more"),
+        "the mounting, {weight_N:.2g} for the weight", "turn wrist 2 and wrist 3 by 60° or more"),
     "clock_offset": Code(_LIMIT, "the wrench lags behind the poses by {delay_s:.3f}", "correct one of the clocks, or "
         "check that the times of both files have the same meaning"),
     "positions_missing": Code(_LIMIT, "positions are missing, so only slow motion is used ({share_percent:.0f}), with "
         "errors of up to {force_N:.2g}", "give the position of the flange too"),
-    "height_differs": Code(_LIMIT, "by the motion the sensor is {height_mm:~sigma_mm} above the flange (sigma "
+    "height_differs": Code(_LIMIT, "the motion places the sensor {height_mm:~sigma_mm} above the flange (sigma "
         "{sigma_mm:~sigma_mm}), not {configured_mm:.3g}", "correct [sensor] height_mm, or check the positions"),
     "mostly_contact": Code(_LIMIT, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
         "{force_N:.2g}", "keep the tool free for most of the recording"),
@@ -426,24 +422,25 @@ CODES: Final[Mapping[str, Code]] = {
         "60 °/s or more"),
     # How well the data fit
     "gain_not_modelled": Code(_LIMIT, "the gain is off by {gain_percent:.1f}, which this method ignores (residual "
-        "{residual_N:.2g}, with it {free_N:.2g})", "solve with method ml"),
+        "{residual_N:.2g}, with the gain estimated {free_N:.2g})", "solve with method ml"),
     "force_error": Code(_REJECT_OR_LIMIT, "the force error is {share_percent:.1f} of the weight ({error_N:.2g}, "
         "{source}), limit {limit_percent:g}", "check cables, contact and orientations, and take more poses"),
-    "torque_error": Code(_REJECT_OR_LIMIT, "the torque error is {share_percent:.1f} of the weight at {lever_m:.2g} "
-        "({error_Nm:.2g}, {source}), limit {limit_percent:g}",
-        "check cables, contact and orientations, and take more poses"),
-    "known_values_misfit_force": Code(_LIMIT, "method ml without known values fits the forces to {free_N:.2g} instead "
-        "of {residual_N:.2g}", "check the known values and what the method assumes, or take more poses"),
-    "known_values_misfit_torque": Code(_LIMIT, "method ml without known values fits the torques to {free_Nm:.2g} "
-        "instead of {residual_Nm:.2g}", "check the known values and what the method assumes, or take more poses"),
+    "torque_error": Code(_REJECT_OR_LIMIT, "the torque error is {share_percent:.1f} of the weight times {lever_m:.2g} "
+        "({error_Nm:.2g}, {source}), limit {limit_percent:g}", "check cables, contact and orientations, and take more "
+        "poses"),
+    "known_values_misfit_force": Code(_LIMIT, "method ml without known values fits the forces to within {free_N:.2g} "
+        "instead of {residual_N:.2g}", "check the known values and what the method assumes, or take more poses"),
+    "known_values_misfit_torque": Code(_LIMIT, "method ml without known values fits the torques to within "
+        "{free_Nm:.2g} instead of {residual_Nm:.2g}", "check the known values and what the method assumes, or take "
+        "more poses"),
     "response_not_linear": Code(_LIMIT_OR_NOTE, "the response of the sensor is nonlinear by {share_percent:.2g} of the "
         "weight, which is not compensated", "stay within the range of the sensor, or have it calibrated"),
     "cable_acts": Code(_LIMIT_OR_NOTE, "something, such as a cable, pulls with {force_N:.2g} and {torque_Nm:.2g} as "
         "the tool turns, which is not compensated", "give cables and hoses more slack"),
-    "orientations_smoothly_off": Code(_LIMIT_OR_NOTE, "the orientations have smooth errors of {turn_deg:.2g}",
+    "orientations_smoothly_off": Code(_LIMIT_OR_NOTE, "the orientations have smoothly varying errors of {turn_deg:.2g}",
         "fasten base, sensor and tool, use the factory calibration of the arm, or stiffen the mount"),
     "noise_exceeded": Code(_LIMIT_OR_NOTE, "the residuals are {factor:.1f} times the measured noise "
-        "({components:?found: |not in the sigmas}{components:.2g})",
+        "({components:?found: |not included in the sigmas}{components:.2g})",
         "look for drift, cables, contact and inexact orientations"),
     "poses_rejected": Code(_LIMIT_OR_NOTE, "{count} of {n_poses} poses were rejected because they do not fit the "
         "others", "repeat {poses:poses}"),
@@ -463,17 +460,17 @@ CODES: Final[Mapping[str, Code]] = {
     "load_mass": Code(_REJECT, "the load at {name} weighs {found_kg:~sigma_kg}, not {given_kg:.3f}", "weigh it again"),
     "load_tool_mass": Code(_REJECT, "the tool weighs {found_kg:~sigma_kg}, not {given_kg:.3f}", "weigh it again"),
     "load_place": Code(_REJECT, "the load at {name} hung at {found_mm:.0f}, not at {given_mm:.0f}, {off_mm:.0f} "
-        "away", "check which hole, and measure again"),
+        "away", "check which hole was used, and measure again"),
     "load_moved": Code(_REJECT, "the load at {name} moved by {moved_mm:.1f} after pose {pose}",
-        "fix its point, and repeat that run"),
+        "secure the point from which it hangs, and repeat that run"),
     "load_pulled": Code(_REJECT, "something pulls the load at {name} sideways with {force_N:.2g}",
-        "let it hang free of everything, and repeat that run"),
+        "let it hang freely, and repeat that run"),
     "load_bias_stepped": Code(_REJECT, "the bias changes by {force_N:.2g} and {torque_Nm:.2g} after pose {pose} of "
         "{run}", "repeat that run without touching the arm"),
     "load_touched": Code(_REJECT, "something touched the load or the tool in {poses:poses} of {run}",
         "repeat that run"),
-    "sensor_not_linear": Code(_REJECT, "the sensor is not linear: {remaining_percent:.1f} of the load remain in the "
-        "readings", "use a load within its range, or have the sensor calibrated by its maker"),
+    "sensor_not_linear": Code(_REJECT, "the sensor is nonlinear: {remaining_percent:.1f} of the load remains in the "
+        "residuals", "use a load within its range, or have the sensor calibrated by its maker"),
     "matrix_changed": Code(_REJECT, "the matrix of the sensor differs by {sigmas:.1f} sigma from the previous one, "
         "most in {entry}", "check masses and places, then accept it with --accept"),
     # Notes
@@ -482,14 +479,15 @@ CODES: Final[Mapping[str, Code]] = {
     "axes_mixed": Code(_NOTE, "the sensor mixes forces along {axes} by {share_percent:.1f}, corrected"),
     "cross_talk": Code(_NOTE, "the sensor reads up to {torque_mNm:.2g} of torque for 1 N of force, corrected"),
     "response_small": Code(_NOTE, "the sensor has a small error of gain or cross-talk, corrected"),
-    "cable_spring": Code(_NOTE, "a torque of {torque_Nm:.2g}, as of a cable, may shift the centre of mass by "
+    "cable_spring": Code(_NOTE, "a torque of {torque_Nm:.2g}, such as from a cable, may shift the centre of mass by "
         "{shift_mm:.2g}", "give the cable more slack"),
     "residuals_alike": Code(_NOTE, "the residuals of successive poses correlate by {correlation:.2f}, most likely "
-        "from drift", "let the sensor warm up and mix the order of the poses"),
+        "from drift", "let the sensor warm up and shuffle the order of the poses"),
     "pose_deviates": Code(_NOTE, "{pose:poses} deviates from the others by {sigmas:.1f} sigma",
         "consider repeating it"),
-    "gravity_tilted": Code(_NOTE, "gravity is tilted by {off_deg:.0f}, along {direction:.2f} in base, as for a robot "
-        "on a slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations"),
+    "gravity_tilted": Code(_NOTE, "gravity is tilted by {off_deg:.0f}, along {direction:.2f} in base axes, as for a "
+        "robot on a slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the "
+        "orientations"),
     "base_leans": Code(_NOTE, "the base leans {lean_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) towards its {side} "
         "from the declared mounting", "level the base, or set its mounting in the controller"),
     "noise_unknown": Code(_NOTE, "chi2 does not test the fit, because the noise was estimated from the residuals",
@@ -497,18 +495,19 @@ CODES: Final[Mapping[str, Code]] = {
     "orientations_deviate": Code(_NOTE, "the poses deviate by up to {off_deg:.2f} from the 24 orientations: a force "
         "error of {force_N:.2g}", "use --method lrom or ml, which take the orientations as they are"),
     "earlier_cell": Code(_NOTE, "mounting, base and gain are taken from {parent}, with their sigmas"),
-    "together": Code(_NOTE, "{n_runs} runs were combined, each with its own bias; the result has the last bias"),
+    "together": Code(_NOTE, "{n_runs} runs were combined, each with its own bias; the result has the bias of the last "
+        "run"),
     "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),
     # Hints about single poses, shown beside the result
     "pose_turned": Code(_NOTE, "{pose:poses} turned by {turn_deg:.2f} while it was averaged", "repeat it"),
     "pose_unsteady": Code(_NOTE, "{pose:poses} was not steady while it was averaged",
-        "look for what swings or touches, and repeat it"),
+        "look for something that swings or touches the tool, and repeat the pose"),
     "pose_off": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}"),
     "pose_touched": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}, as if touched, bumped or "
         "pulled by a cable", "repeat it"),
     "load_swings": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}: a torque without a force",
         "check whether the load tilts or swings"),
-    "cable_pulls": Code(_NOTE, "something pulls in {poses:poses}",
+    "cable_pulls": Code(_NOTE, "something pulls on the tool in {poses:poses}",
         "give slack to a cable that is too short there, and repeat these poses"),
     "sensor_drifts": Code(_NOTE, "the reading of the first pose differs at the end, and the poses between drift too",
         "let the sensor warm up for 15 to 30 min, then calibrate again"),

@@ -81,7 +81,7 @@ def is_edited(document: Mapping[str, Any], derived: Mapping[str, JSON], *, accep
     edited = is_changed(document) or any(document.get(name, value) != value for name, value in derived.items())
     if edited and not accept:
         raise BadCalibration(
-            f"the content is not that of calibration {document.get('id')}: the file is damaged or was edited. Take "
+            f"the content is not that of calibration {document.get('id')}: the file is damaged or was edited. Restore "
             "it from a copy, or apply it as it is with --force (live, record, stream, compensate, export)."
         )
     return edited

@@ -332,7 +332,7 @@ class SensorMatrix(Displayed):
     def __post_init__(self) -> None:
         keep_finite(self, "the sensor's ", error=(6, 6), covariance=(39, 39))
         if self.source not in ("assumed", "data sheet", "loads"):
-            raise ValueError(f"the source is {self.source!r}, not assumed, data sheet or loads")
+            raise ValueError(f"the source is {self.source!r}, expected assumed, data sheet or loads")
         if not (0 < self.lever_m < np.inf and 0 <= self.floor < 1):
             raise ValueError(f"lever_m is {self.lever_m} and floor {self.floor}, expected positive numbers")
 

@@ -27,7 +27,7 @@ _QUANTITIES: Final[Sequence[tuple[str, float, str, str]]] = (
 )
 _IN_MOTION: Final[Sequence[tuple[str, float, str, str]]] = (
     ("inertia", 1e3, "g·m²", "inertia_kg_m2"),
-    ("wrench after pose", 1e3, "ms", "delay_s"),
+    ("delay of wrench", 1e3, "ms", "delay_s"),
     ("sensor above flange", 1e3, "mm", "height_m"),
 )
 # A standard deviation below this share of the largest one is a rounding error: the value was exactly known.

@@ -255,7 +255,7 @@ class ArmStatus:
     fault: DeviceFault | None
     """Reason why the arm may not move, and what the operator has to do; None if it may move."""
     speed_slider: float
-    """Speed slider, 0 to 1, as set at the pendant or by a program."""
+    """Speed slider, 0 to 1, as set on the pendant or by a program."""
     speed_scaling: float
     """Fraction of the programmed speed that the controller allows at the moment, 0 to 1."""
     payload_kg: float | None

@@ -120,7 +120,7 @@ def _ask_sensor(probe: CanProbe, heard: Sequence[CanFrame], bus: CanBus) -> Answ
         some = ", ".join(f"0x{identifier:03X}" for identifier in busy[:4]) + (" …" if busy[4:] else "")
         return Answer(
             None,
-            f"{probe.name} was not asked, because another device sends on {some}; "
-            f"use {probe.url} if you know that it is there",
+            f"{probe.name} was not queried, because another device sends on {some}; use {probe.url} if you know that "
+            "this sensor is connected",
         )
     return Answer(probe.url, what) if (what := probe.ask(bus)) else None

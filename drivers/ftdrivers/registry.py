@@ -193,7 +193,7 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
     begins = (f"{parts.scheme}://", "ros2:/")  # a topic is a path, without a host
     if not parts.address.strip("/") or parts.fragment or not url.lower().startswith(begins):
         examples = [example for example in _EXAMPLES if example.startswith(f"{parts.scheme}:")] or _EXAMPLES
-        raise BadUrl(f"{url}: names no device; write it like {', '.join(examples)}")
+        raise BadUrl(f"{url} names no device; write it like {', '.join(examples)}")
     driver = _load(entry)
     if not hasattr(driver, "from_url"):
         raise BadUrl(f"{url}: {entry.value} has no from_url, so it is not a driver; reinstall {_package(entry)}")
@@ -236,7 +236,7 @@ def _find(group: str, own: Mapping[str, str], name: str) -> EntryPoint | None:
     found = sorted(entry_points(group=group, name=name), key=lambda entry: entry.value)
     if len(found) > 1:
         packages = " and ".join(_package(entry) for entry in found)
-        raise BadUrl(f"'{name}' is offered by {packages}; uninstall one of them")
+        raise BadUrl(f"'{name}' is provided by {packages}; uninstall one of them")
     return found[0] if found else None
 
 

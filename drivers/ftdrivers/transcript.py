@@ -249,7 +249,7 @@ class Transcript:
                     return _watch(device, duration_s)
             except Exception as error:
                 if player.divergence:
-                    raise ProtocolError(f"{error}; the transcript does not answer: {player.divergence}") from error
+                    raise ProtocolError(f"{error}; the transcript has no reply: {player.divergence}") from error
                 silent = isinstance(error, ConnectError | DeviceTimeout)
                 if silent and self.is_broken_off and player.left_s < _TAIL_S:
                     raise BadTranscript(

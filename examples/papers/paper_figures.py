@@ -403,7 +403,7 @@ def pairwise_nullspace(A: Array, f: Array, *, successive: bool) -> Array:
     if successive:
         first, second = np.arange(len(f) - 1), np.arange(1, len(f))
     rows = np.einsum("nji,nk->nikj", A, f).reshape(-1, 3, 9)  # A_i^T (f_i^T (x) I): the gravity force in base axes
-    r = np.linalg.svd((rows[first] - rows[second]).reshape(-1, 9))[2][-1]
+    r = np.linalg.svd((rows[first] - rows[second]).reshape(-1, 9), full_matrices=False)[2][-1]
     X = r.reshape(3, 3).T
     return nearest_rotation(X * np.sign(np.linalg.det(X)))
 
@@ -437,15 +437,16 @@ def algorithm_1(A: Array, f: Array, g: Array, steps: int, *, negate: bool) -> tu
     `negate` is not printed: a matrix of negative determinant, from a g that points the wrong way, is negated.
     """
     inverse = np.linalg.inv(np.einsum("rni,rnj->rij", f, f))
+    sums = np.einsum("rnij,rnk->rijk", A, f)
     rotations, gravities = list[Array](), list[Array]()
     for _ in range(steps):
-        X = np.einsum("rnij,rj,rnk->rik", A, g, f) @ inverse
+        X = np.einsum("rijk,rj->rik", sums, g) @ inverse
         if negate:
             X *= np.sign(np.linalg.det(X))[:, None, None]
         U, _, Vt = np.linalg.svd(X)
         U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
         rotations.append(U @ Vt)
-        g = np.einsum("rnji,rjk,rnk->ri", A, rotations[-1], f) / A.shape[1]
+        g = np.einsum("rjik,rjk->ri", sums, rotations[-1]) / A.shape[1]
         gravities.append(g)
     return np.array(rotations), np.array(gravities)
 

@@ -55,7 +55,7 @@ class SupervisorGone(FtdriveError):
     `why` names what was closed, `effect` the consequence and the remedy.
     """
 
-    def __init__(self, why: str, effect: str = "the session ends, the arm at rest; continue it with --resume") -> None:
+    def __init__(self, why: str, effect: str = "the session ends with the arm at rest; continue with --resume") -> None:
         super().__init__(f"{why}: {effect}")
 
 
@@ -84,7 +84,7 @@ def exit_code(error: BaseException) -> int | None:
 def in_a_sentence(error: BaseException) -> str:
     """Return the message of an error; for an operating system error also the file and what to check."""
     if isinstance(error, ModuleNotFoundError):
-        return f"Python on {platform.system()} has no module {error.name}, which this needs: use Linux"
+        return f"Python on {platform.system()} has no module {error.name}, which is needed here: use Linux"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}: check this path and its permissions"
     if isinstance(error, OSError) and error.errno == ENOSPC:

@@ -68,9 +68,9 @@ def solve(
         table with closely spaced rows, a bag, a file of `ftdrive record` and a result of `read_recording` are
         recordings in motion.
     method : Method
-        "ml": maximum likelihood, from 4 poses on; or one of the published methods, for comparison.
+        "ml": maximum likelihood, which needs at least 4 poses; or one of the published methods, for comparison.
     table : TableOptions, optional
-        Description of a table, for what the table does not contain.
+        What the table itself does not contain.
     drift, known, g_m_s2, setup, provenance, as_published
         As for `ftcalib.solver.solve`. For a recording in motion, only `known` and the up direction of `setup` are used.
 
@@ -83,7 +83,7 @@ def solve(
     ValueError
         The method is unknown, cannot use the known values, or does not support `as_published`.
     TypeError
-        The source has another type; the message names the right call.
+        The type of the source is not supported; the message names the right call.
 
     Examples
     --------
@@ -135,7 +135,7 @@ def read_recording(
     calibration : CalibrationResult, optional
         Calibration for a recording of another program, which has none; `raw` is the measured wrench, `wrench` is 0.
     table : TableOptions, optional
-        Description of a table, for what the table does not contain.
+        What the table itself does not contain.
 
     Raises
     ------
@@ -479,7 +479,7 @@ def solve_load_runs(
     identity, data = read[0][1:]
     if other := next((one for _, one, _ in read if one != identity), None):
         name, ours = next((name, value) for name, value in identity.items() if other[name] != value)
-        raise ConfigError(f"the runs are of different sensors ({name} {ours} and {other[name]}): give those of one")
+        raise ConfigError(f"the runs are of different sensors ({name} {ours} and {other[name]}): give runs of one")
     of_cells = (one.setup.weighed_kg for _, _, one in read if one.setup.weighed_kg is not None)
     weighed = next(of_cells, None) if tool_mass is None else mass_of(tool_mass)
     prior = _prior_matrix(data, identity, [path.name for path in paths], say)

@@ -71,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
         "everything listens; ends when standard input closes. Vectors are numbers separated by commas.",
     )
     add = station.add_argument
-    add("--seed", type=int, default=0, help="draws the truth below, the noise and the start posture (default 0)")
+    add("--seed", type=int, default=0, help="seed of the truth below, the noise and the start posture (default 0)")
     add("--host", help="loopback address to listen on (default: a free 127.x.y.z)")
     add("--time-scale", type=_positive, default=1.0, metavar="K", help="the arm moves K times faster than real")
     add("--sensor", choices=CHOICES, default="can", metavar="NAME", help=f"{', '.join(CHOICES)} (default can)")
@@ -86,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
         "--imperfections",
         default="",
         metavar="NAME=VALUE,…",
-        help="what a real cell does beside the model, none: nothing; "
+        help="imperfections of a real cell that the model lacks; none turns all of them off; "
         + ", ".join(f"{field.name} ({field.default:g})" for field in fields(Imperfections)),
     )
     add("--sensor-delay-ms", type=float, metavar="D", help="time between the measurement of a sample and its sending")
@@ -105,8 +105,8 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DEG",
         help=f"swing of a load after it is hung (default {SWING_DEG:g})",
     )
-    add("--pace", type=_not_negative, metavar="K", help="play it K times faster (default 1; 0: hold the first row)")
-    add("--do", action="append", default=[], metavar="JSON", help="a request of the control channel to begin with")
+    add("--pace", type=_not_negative, metavar="K", help="play FILE.csv K times faster (default 1; 0: hold its start)")
+    add("--do", action="append", default=[], metavar="JSON", help="a first request of the control channel")
 
     arm = station.add_argument_group("arm")
     add = arm.add_argument
@@ -122,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--serial-number", default="20225500001")
     add("--tcp", type=_vector(6), default=[0.0] * 6, metavar="x,y,z,rx,ry,rz", help="active TCP, m and rad")
     add("--payload", type=float, metavar="kg", help="payload set in the controller (default: tool and sensor)")
-    add("--payload-cog", type=_vector(3), metavar="x,y,z", help="its centre in the flange, m (default: theirs)")
+    add("--payload-cog", type=_vector(3), metavar="x,y,z", help="its centre of mass in the flange frame, m")
     add("--start-q-deg", type=_vector(6), metavar="q1,…,q6", help="start posture (default near the tour's first pose)")
     add("--joint-limit-deg", type=_positive, default=360.0)
     add("--plane", type=_plane, metavar="nx,ny,nz,d", help="safety plane in base: n·p >= d (m) is allowed")
@@ -136,7 +136,7 @@ def _parser() -> argparse.ArgumentParser:
         "--kinematics-message",
         choices=("true", "none", "wrong"),
         default="true",
-        help="what the primary interface sends of it; wrong: that of another arm of the same model (default true)",
+        help="kinematics that the primary interface sends; wrong: that of another arm of the same model (default true)",
     )
 
     truth = station.add_argument_group("truth (each overrides what the seed draws)")
@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
         "'none': the payload has weight, but no inertia",
     )
     add(
-        "--sensor-origin", type=_vector(3), metavar="x,y,z", help="of the sensor in the flange frame, m (default 0,0,0)"
+        "--sensor-origin", type=_vector(3), metavar="x,y,z", help="sensor origin in the flange frame, m (default 0,0,0)"
     )
     add(
         "--sensor-mass-kg",
@@ -181,7 +181,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_not_negative,
         default=0.0,
         metavar="PERCENT",
-        help="square and cube at the end of its range",
+        help="quadratic and cubic error at the end of the range",
     )
     add("--force-drift", type=_vector(3), metavar="x,y,z", help="N per minute (default 0)")
     add("--torque-drift", type=_vector(3), metavar="x,y,z", help="N·m per minute (default 0)")

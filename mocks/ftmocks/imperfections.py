@@ -118,7 +118,7 @@ class WarmUp(NamedTuple):
 
 
 class Ripple:
-    """Vibration of the tool, caused by the gears of turning joints. `seed` draws the phases."""
+    """Vibration of the tool, caused by the gears of rotating joints. `seed` draws the phases."""
 
     def __init__(self, settings: Imperfections, seed: int) -> None:
         self._orders = settings.gear_ratio * np.array(HARMONICS)

@@ -97,7 +97,7 @@ class Recording:
             `at_s` is not in the recording, or the pace is negative or not finite.
         """
         if not (0.0 <= at_s <= self.duration_s and 0.0 <= pace < np.inf):
-            raise ValueError(f"at_s is {at_s} and pace {pace}; give 0 to {self.duration_s}, and a pace from 0 on")
+            raise ValueError(f"at_s is {at_s} and pace {pace}; give 0 to {self.duration_s}, and a pace of 0 or more")
         self._played = (now_s, at_s, pace)
 
     def at_s(self, t_s: float) -> float:

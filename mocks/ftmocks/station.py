@@ -133,7 +133,7 @@ def _recording(options: Namespace) -> Recording | None:
             raise ValueError("--pace needs --recording")
         return None
     if options.time_scale != 1.0 or options.start_q_deg is not None:
-        raise ValueError("--recording gives time and joints: leave --time-scale and --start-q-deg out")
+        raise ValueError("--recording provides time and joints: leave --time-scale and --start-q-deg out")
     try:
         return Recording.read(options.recording)
     except OSError as error:

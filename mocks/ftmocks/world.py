@@ -326,7 +326,7 @@ class World:
         return load
 
     def ripple_wrench(self, t_s: Array) -> Array:
-        """Return the wrench (n, 6) or (1, 6) of the vibration of turning joints, at increasing times (n,)."""
+        """Return the wrench (n, 6) or (1, 6) of the vibration of rotating joints, at increasing times (n,)."""
         first_s, last_s = float(t_s[0]), float(t_s[-1])
         (first, moved), (last, moves) = self._joints(first_s), self._joints(last_s)
         if not (self.imperfections.ripple and (moved or moves)):

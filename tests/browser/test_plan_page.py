@@ -41,7 +41,7 @@ def test_the_tour_is_looked_at(ftdrive: CommandLine, open_page: "Callable[..., P
     at = slider.input_value()
     page.get_by_role("checkbox").check()
     legend = page.locator("#legend")
-    legend.get_by_text("room that the tool sweeps over").wait_for()
+    legend.get_by_text("space swept by the tool").wait_for()
     for words in ("arm", "tool", "path of the tool tip", "ball to keep free", "surroundings"):
         assert legend.get_by_text(words, exact=True).is_visible()
     assert slider.input_value() == at

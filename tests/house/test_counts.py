@@ -5,6 +5,7 @@ lowers its ceiling here.
 """
 
 import ast
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,6 +33,7 @@ ROOMS = {
 """Modules that a command walks through: the definition is that of `rooms.py`."""
 
 LINES_OF_A_MODULE = 700
+parsed = functools.cache(ast.parse)
 
 
 def sentence(row: str, count: int, ceiling: int) -> str:
@@ -45,7 +47,7 @@ def sentence(row: str, count: int, ceiling: int) -> str:
 
 def counts_of(sources: dict[str, str]) -> dict[str, int]:
     """Count what the product has, except for lines of tests."""
-    trees = [ast.parse(source) for source in sources.values()]
+    trees = [parsed(source) for source in sources.values()]
     nodes = [node for tree in trees for node in ast.walk(tree)]
     public = [node for tree in trees for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
     inside = {
@@ -73,7 +75,7 @@ def faults(sources: dict[str, str]) -> Iterator[str]:
     for path, source in sources.items():
         if (more := len(source.splitlines()) - LINES_OF_A_MODULE) > 0:
             yield f"{path} has {LINES_OF_A_MODULE + more} lines, {more} too many: divide it by what a reader looks for."
-        for node in ast.walk(ast.parse(source)):
+        for node in ast.walk(parsed(source)):
             for name in node.names if isinstance(node, ast.ImportFrom) else ():
                 if name.name.startswith("_") and not name.name.startswith("__"):
                     yield f"{path}:{name.lineno} imports {name.name}: give it a public name, or move what uses it."

@@ -47,7 +47,7 @@ class Stream(FakeStream):
         time.sleep(0.002)
         if self.silent:
             time.sleep(0.3)
-            raise DeviceTimeout("the sensor sent nothing new for 0.3 s", "check cable and supply")
+            raise DeviceTimeout("the sensor sent nothing new for 0.3 s", "check cable and power")
         if (replaced := self.replaced) is not None:
             self.replaced = None
             return replaced

@@ -170,7 +170,7 @@ def test_tf_without_its_messages_is_one_sentence() -> None:
     if find_spec("tf2_msgs"):
         pytest.skip("a sourced ROS has tf2_msgs")
     arm = Ros2Arm("ros2:tf?base=base&flange=tool0")
-    with closing(arm), pytest.raises(NoRos2, match=r"cannot import tf2_msgs .*source a ROS 2"):
+    with closing(arm), pytest.raises(NoRos2, match=r"cannot import tf2_msgs .*source ROS 2"):
         arm.open()
 
 
@@ -178,8 +178,8 @@ def test_tf_without_its_messages_is_one_sentence() -> None:
     ("url", "words"),
     [
         ("ros2:/none", r"no node publishes /none .*topics of this type: /ft/wrench"),
-        ("ros2:/arm/pose", r"/arm/pose has the type geometry_msgs/msg/PoseStamped, needed is geometry_msgs/msg/Wrench"),
-        ("ros2:/ft/wrench?reliable=1", "offered with best effort alone"),
+        ("ros2:/arm/pose", r"/arm/pose has the type geometry_msgs/msg/PoseStamped, but geometry_msgs/msg/Wrench"),
+        ("ros2:/ft/wrench?reliable=1", "published with best effort only"),
     ],
 )
 def test_a_topic_that_is_no_sensor_is_one_sentence(stack: ExitStack, url: str, words: str) -> None:
@@ -214,7 +214,7 @@ def test_a_spoilt_sensor_is_one_sentence(stack: ExitStack, spoil: str, words: st
         (
             "",
             "ros2:/ft/wrench",
-            "has the type geometry_msgs/msg/WrenchStamped, needed is geometry_msgs/msg/PoseStamped",
+            "has the type geometry_msgs/msg/WrenchStamped, but geometry_msgs/msg/PoseStamped is needed",
         ),
     ],
 )

@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
+from ftcalib.sensor_matrix import SensorMatrix
 from tests.system.command_line import CommandLine, assert_demo_found_the_truth
 
 pytestmark = pytest.mark.slow
@@ -22,6 +24,11 @@ def test_known_loads_correct_the_contacts_of_a_sensor(ftdrive: CommandLine) -> N
     assert before["as_read_N"] > 2.0
     assert after["decoded_N"] < 0.3 * before["as_read_N"]
     assert after["decoded_N"] < 3 * after["sigma_N"]
+    found = SensorMatrix.from_dict(shown["sensor"])
+    error = (found.error - shown["truth"]["sensor_error"]).ravel()
+    assert chi2.cdf(error @ np.linalg.solve(found.covariance[3:, 3:], error), error.size) < 0.9973, "3 sigma"
+    # The loads, and not the assumed sizes, determine it.
+    assert (found.sigma.diagonal() < 0.25 * SensorMatrix.usual().sigma.diagonal()).all()
 
 
 def test_the_run_of_a_demo_is_replayed_to_the_same_result(demo: dict[str, Any], ftdrive: CommandLine) -> None:

@@ -267,8 +267,8 @@ def test_the_sensor_that_is_named_is_emulated(
     ("arguments", "words"),
     [
         (("doctor", "--simulate", "--sensor", "bota:///dev/nope"), "bota:///dev/nope"),
-        (("doctor", "--simulate", "--robot", "10.0.0.2"), "--robot does not go with --simulate"),
-        (("solve", "--simulate", "."), "DATASET does not go with --simulate"),
+        (("doctor", "--simulate", "--robot", "10.0.0.2"), "--robot cannot be combined with --simulate"),
+        (("solve", "--simulate", "."), "DATASET cannot be combined with --simulate"),
         (("solve", "--sensor", "emulated://bota", "."), "--sensor is only for --simulate"),
         *(((command,), "--simulate") for command in ("solve", "replay", "report", "bundle", "live", "push")),
         (("push", ".", "--restore", "."), "--restore uses only the receipt"),

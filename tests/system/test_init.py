@@ -159,7 +159,7 @@ def test_nothing_counts_as_measured_until_the_operator_sets_it(addresses: list[s
     assert load().workcell.measured is False
     said = re.sub(r"^# ?", "", text, flags=re.MULTILINE).replace("\n", " ")
     assert "PLACEHOLDERS until measured" in said
-    assert "otherwise nothing moves" in said
+    assert "until then nothing moves" in said
     Path("ftdrive.toml").write_text(text.replace("measured = false", "measured = true"))
     assert load().workcell.measured is True
 

@@ -157,7 +157,7 @@ def test_status_is_what_the_controller_reports_now(station: Station, new_arm: Ne
     assert arm.in_remote_control() is False
     station.ask("freeze")
     station.clock.sleep(0.1)  # what a status may be old
-    with pytest.raises(DeviceTimeout, match="stood still"):
+    with pytest.raises(DeviceTimeout, match="been stuck"):
         arm.status()
     station.kill()
 

@@ -148,11 +148,11 @@ EVENTS = [
     ),
     Event("power-off", lambda s: s.dashboard("power off"), power_up, DeviceFault, "power the arm on"),
     Event("brakes", on("mode", robot=5), on("mode", robot=7), DeviceFault, r"\(idle\); release its brakes"),
-    Event("program-stop", on("dashboard-stop"), nothing, DeviceFault, "or stopped from outside", hits_opening=False),
+    Event("program-stop", on("dashboard-stop"), nothing, DeviceFault, "was stopped from outside", hits_opening=False),
     Event(
         "program-pause", lambda s: s.dashboard("pause"), nothing, DeviceFault, "stopped or paused", hits_opening=False
     ),
-    Event("crash-script", on("crash-script"), nothing, DeviceFault, "ended .* by itself|in line", hits_opening=False),
+    Event("crash-script", on("crash-script"), nothing, DeviceFault, "ended by itself|in line", hits_opening=False),
     Event(
         "foreign-program",
         another_takes_over,
@@ -178,7 +178,7 @@ EVENTS = [
         "press the emergency|by itself",
         reachable=False,
     ),
-    Event("freeze", on("freeze", on=True), on("freeze", on=False), LOST, "stood still|sent nothing", reachable=False),
+    Event("freeze", on("freeze", on=True), on("freeze", on=False), LOST, "been stuck|sent nothing", reachable=False),
     Event(
         "cut",
         lambda s: cut(s, connected=False),
@@ -484,8 +484,8 @@ def test_a_program_of_another_client_is_never_ended_for_a_start(station: Station
         station.wait_for(lambda state: state["runtime_state"] == "PAUSED")
     before = len(station.ask("state")["events"])
     error = refused(station)
-    assert re.search(r"\((PLAYING|PAUSED) .*\), and is not stopped", error.found)
-    assert "stop it at the pendant" in error.fix
+    assert re.search(r"\((PLAYING|PAUSED) .*\) and is not stopped", error.found)
+    assert "stop it on the pendant" in error.fix
     state = station.ask("state", since=before)
     assert not [event for event in state["events"] if event["by"] in ("script port", "program")]
     assert not [event for event in state["events"] if event["by"] == "dashboard" and event["what"] == "stop"]
@@ -498,7 +498,7 @@ def test_a_program_that_took_the_place_of_ours_is_not_ended_when_the_arm_is_open
     station: Station, arm: UrArm
 ) -> None:
     another_takes_over(station)
-    with pytest.raises(ConnectError, match="stop it at the pendant"):
+    with pytest.raises(ConnectError, match="stop it on the pendant"):
         arm.open(control=True)
     assert plays_another(station)
     station.ask("dashboard-stop")
@@ -517,7 +517,7 @@ def test_what_runs_after_ours_was_seen_to_have_ended_is_not_ours(
     station.wait_for(lambda _: arm.status().program == "stopped")
     arm.open()
     another_takes_over(station)
-    with pytest.raises(ConnectError, match="stop it at the pendant"):
+    with pytest.raises(ConnectError, match="stop it on the pendant"):
         arm.open(control=True)
     assert plays_another(station)
     station.ask("dashboard-stop")

@@ -62,7 +62,7 @@ def test_open_state_move_stop_limits_close(start_station: Callable[..., Station]
     ("options", "model", "refused"),
     [
         (("--kinematics-message", "none"), None, None),
-        (("--kinematics-message", "wrong"), None, "kinematics that the controller sends, so that the two contradict"),
+        (("--kinematics-message", "wrong"), None, "kinematics sent by the controller: the two disagree"),
         (("--model", "UR10e", "--polyscope", "5.4.0"), "UR5e", "the arm is another model, probably a UR10e"),
         (("--model", "UR10e"), "UR5e", "is a UR10e, not a UR5e"),
     ],

@@ -172,7 +172,7 @@ def new_tool(
     start = _start(earlier.parameters, dataset.R_base_flange, dataset.wrench)
     noise = pooled_covariance(dataset.wrench_cov, dataset.n_samples)
     prior, data = CellPrior(earlier), "the poses"
-    alone = "calibrate this tool alone, from 12 poses or more"
+    alone = "calibrate this tool alone, with 12 poses or more"
     # A larger dependence on the load is assumed only if no change of the cell explains the poses.
     for load in _LOADS:
         weights: Array = np.linalg.inv(noise + np.diag(_beyond(earlier, start, load))).astype(np.float64)
@@ -310,7 +310,7 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
     if dof and chi2_sf(dof, chi2) < FALSE_ALARMS:
         raise NotObservable(
             f"the runs contradict each other in more than the bias (chi2 {chi2:.0f} for {dof} degrees of freedom): "
-            "`ftdrive diff` shows in what; tool, sensor or base has changed."
+            "tool, sensor or base has changed. `ftdrive diff` shows which values differ."
         )
     shared, own = np.ix_(alike, alike), np.arange(n)[BIASES]
     # The bias is that of the last run, corrected by its correlation with the shared parameters.

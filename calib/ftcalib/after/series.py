@@ -280,11 +280,11 @@ def trend(t: Array, values: Array, covariance: Array) -> Trend:
     t, values = np.asarray(t, dtype=np.float64), np.asarray(values, dtype=np.float64)
     n, k = values.shape
     if n < FEWEST_ESTIMATES or np.ptp(t) == 0:
-        raise ValueError(f"{n} estimates at {len(np.unique(t))} times have no trend: give {FEWEST_ESTIMATES} or more")
+        raise ValueError(f"{n} estimates at {len(np.unique(t))} times show no trend: give {FEWEST_ESTIMATES} or more")
     try:
         whiten = np.linalg.inv(np.linalg.cholesky(covariance))  # (n, k, k)
     except np.linalg.LinAlgError as error:
-        raise ValueError("a covariance is not positive definite: leave out values taken as known") from error
+        raise ValueError("a covariance is not positive definite: exclude values that were taken as known") from error
     scale = float(np.ptp(t))
     design = np.concatenate([whiten, whiten * ((t - t.mean()) / scale)[:, None, None]], axis=2).reshape(n * k, 2 * k)
     readings = (whiten @ (values - values.mean(axis=0))[..., None]).reshape(n * k)

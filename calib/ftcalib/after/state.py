@@ -104,7 +104,7 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     wrench = require_finite("wrench", wrench, (n, 6))
     C = calibration.joint_covariance
     if not old.gravity_force_base_N.any() and kind != "bias":
-        raise NotObservable("the calibration has no weight, so the direction of gravity is unknown: calibrate first.")
+        raise NotObservable("the tool has no weight, so the direction of gravity is unknown: calibrate again.")
     new = old
     for _ in range(MOST_STEPS):
         estimated, kept = _directions(new, BLOCKS[kind]), _kept_derivative(old, new, BLOCKS[kind], len(C))
@@ -122,8 +122,9 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
             weight_N, sigma_N = float(new.weight_N + x[0]), float(np.sqrt(inverse[0, 0]))
             if not weight_N > SIGNIFICANT_SIGMAS * sigma_N:
                 raise NotObservable(
-                    f"the weight of the payload, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty "
-                    f"of {sigma_N:.2g} N: hang something heavier on the sensor, or check the sign and the tare."
+                    f"the weight of the payload, {weight_N:.3g} N, is less than {SIGNIFICANT_SIGMAS:g} times its "
+                    f"uncertainty of {sigma_N:.2g} N: hang something heavier on the sensor, or check the sign and the "
+                    "tare."
                 )
         chi2 = float(left @ np.linalg.solve(S, left))
         if float(x @ information @ x) < SETTLED * max(1.0, chi2):
@@ -330,10 +331,9 @@ def tare(
     limit = float(chi2_isf(6, FALSE_ALARMS))
     for i in np.flatnonzero(sigmas**2 > limit).tolist():
         raise BadDataset(
-            f"pose {i + 1}: the reading is {np.linalg.norm(change[i, :3]):.2g} N and "
-            f"{np.linalg.norm(change[i, 3:]):.2g} N·m from the prediction, more than drift explains "
-            f"(d² {sigmas[i] ** 2:.0f}, limit {limit:.1f}): free the tool, or calibrate again if the payload has "
-            "changed."
+            f"pose {i + 1}: the reading differs from the prediction by {np.linalg.norm(change[i, :3]):.2g} N and "
+            f"{np.linalg.norm(change[i, 3:]):.2g} N·m, more than drift explains (test value {sigmas[i] ** 2:.0f}, "
+            f"limit {limit:.1f}): free the tool, or calibrate again if the payload has changed."
         )
     # Gain and cross-talk are kept, with their uncertainty, for parts that are weighed after the tare.
     known = Calibrated(calibration.parameters, calibration.covariance, calibration.shown_response)

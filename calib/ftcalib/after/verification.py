@@ -369,10 +369,10 @@ def verify_calibration(
     wrench = require_finite("wrench", wrench, (n, 6))
     wrench_cov = require_finite("wrench_cov", wrench_cov, (n, 6, 6))
     if not 0 < false_alarms < 1:
-        raise ValueError(f"false_alarms is {false_alarms}, expected a share between 0 and 1")
+        raise ValueError(f"false_alarms is {false_alarms}, expected a fraction between 0 and 1")
     if fitted is not None and len(fitted) != calibration.n_poses:
         raise BadDataset(
-            f"`fitted` has {len(fitted)} poses, but the calibration has {calibration.n_poses}: give its dataset."
+            f"`fitted` has {len(fitted)} poses, but the calibration has {calibration.n_poses}: pass its dataset."
         )
     explanations = [[expected_as_found(calibration, R_base_flange, wrench_cov)]]
 
@@ -467,8 +467,8 @@ def _explain_alarm(
     force_N, torque_Nm = (float(np.linalg.norm(alarm.residual[worst, c])) for c in (slice(3), slice(3, 6)))
     return replace(
         alarm,
-        reason=f"no change of bias, payload, mounting or base explains the readings ({misfit}; the farthest is pose "
-        f"{worst + 1} with {force_N:.2g} N and {torque_Nm:.2g} N·m): free tool and cables and verify again with 6 "
+        reason=f"no change of bias, payload, mounting or base explains the readings ({misfit}; pose {worst + 1} "
+        f"deviates most, by {force_N:.2g} N and {torque_Nm:.2g} N·m): free tool and cables and verify again with 6 "
         "poses or more, or calibrate again",
     )
 
@@ -502,5 +502,5 @@ def _describe_update(calibration: CalibrationResult, update: Update) -> str:
         words.append(f"the sensor has turned on the flange by {np.rad2deg(np.linalg.norm(error[:3])):.2g}°")
     if update.kind in ("base", "all"):
         turned_rad = angle_between_vectors(old.gravity_force_base_N, new.gravity_force_base_N)
-        words.append(f"gravity has turned in the base by {np.rad2deg(turned_rad):.2g}°")
+        words.append(f"gravity has turned in base axes by {np.rad2deg(turned_rad):.2g}°")
     return ", ".join(words)

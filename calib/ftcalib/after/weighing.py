@@ -98,7 +98,7 @@ class Weight(Displayed):
 
     def _summary(self) -> Summary:
         mass = with_sigma(self.mass_kg, self.mass_sigma_kg)
-        rows = [Row("least mass that differs from 0", [to_place_of(self.least_kg, self.mass_sigma_kg)], "kg")]
+        rows = [Row("smallest detectable mass", [to_place_of(self.least_kg, self.mass_sigma_kg)], "kg")]
         if self.is_something:
             rows.append(Row("centre of mass x, y, z", self.com_in_words, "mm in sensor axes"))
         return Summary(

@@ -297,7 +297,7 @@ def _covariance_problem(C: Array) -> str | None:
     correlation = C / np.outer(np.sqrt(variance), np.sqrt(variance))
     asymmetry = np.abs(correlation - correlation.T).max()
     if asymmetry > 1e-9:
-        return f"it is not symmetric (by {asymmetry:.2g} of a correlation)"
+        return f"it is not symmetric (correlations differ by {asymmetry:.2g})"
     smallest = np.linalg.eigvalsh(correlation).min()
     if smallest <= 1e-12:
         return f"it is not positive definite (smallest eigenvalue of the correlation {smallest:.2g})"
@@ -368,7 +368,7 @@ def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
 
 
 def _spread_within(S: Array, shape: Array) -> Array:
-    """Return the variance (n,) of the logarithms of the six variances of each covariance, relative to the shape."""
+    """Return the variance (n,) of the logarithms of the six variances of each covariance after whitening by `shape`."""
     white = np.linalg.inv(np.linalg.cholesky(shape))
     log_variances = np.log(S @ np.einsum("ca,cb->abc", white, white).reshape(36, 6))
     log_variances -= np.median(log_variances, axis=0)  # robust against poses with another shape

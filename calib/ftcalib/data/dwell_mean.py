@@ -152,7 +152,7 @@ def noise_level(wrench: Array, window: int) -> Array:
     """
     wrench = _require_samples(wrench)
     if not LEAST_SAMPLES <= window <= len(wrench):
-        raise BadDataset(f"a window of {window} samples does not fit a record of {len(wrench)}: choose 20 or more.")
+        raise BadDataset(f"a window of {window} does not fit a record of {len(wrench)}: choose 20 to {len(wrench)}.")
     windows = wrench[: len(wrench) // window * window].reshape(-1, window, 6)
     return np.asarray(np.median(windows.std(axis=1, ddof=1), axis=0))
 
@@ -323,8 +323,8 @@ def averaging_time(wrench: Array, rate_Hz: float, *, target_force_N: float, targ
     wrench = _require_samples(wrench)
     if not rate_Hz > 0 or len(wrench) / rate_Hz < (1 - 1e-3) * AVERAGES_IN_RECORD * SHORTEST_S:
         raise BadDataset(
-            f"a record of {len(wrench)} samples at {rate_Hz:g} Hz is too short for choosing an averaging time: "
-            f"record at least {AVERAGES_IN_RECORD * SHORTEST_S:.0f} s."
+            f"a record of {len(wrench)} samples at {rate_Hz:g} Hz is too short to choose an averaging time: record at "
+            f"least {AVERAGES_IN_RECORD * SHORTEST_S:.0f} s."
         )
     size = max(1, int(BLOCK_S * rate_Hz))
     blocks = wrench[: len(wrench) // size * size].reshape(-1, size, 6).mean(axis=1)

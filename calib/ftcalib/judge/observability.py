@@ -111,15 +111,15 @@ def require_orientations(R_base_flange: Array, least: int = LEAST_POSES) -> None
     n, different = len(R_base_flange), different_orientations(R_base_flange)
     if n < least:
         raise NotObservable(
-            f"{n} {'pose is' if n == 1 else 'poses are'} too few, at least {least} are needed: add {least - n}, better "
-            f"{max(RECOMMENDED_POSES, least) - n}."
+            f"{n} {'pose is' if n == 1 else 'poses are'} too few, at least {least} are needed: add {least - n}, or "
+            f"better {max(RECOMMENDED_POSES, least) - n}."
         )
     if different == 1:
         raise NotObservable(f"all {n} poses have the same orientation: turn and tilt the tool between poses.")
     if different < least:
         raise NotObservable(
-            f"the {n} poses have only {different} different orientations, at least {least} are needed: "
-            "turn and tilt the tool to others."
+            f"the {n} poses have only {different} different orientations, at least {least} are needed: turn and tilt "
+            "the tool between poses."
         )
 
 
@@ -170,7 +170,7 @@ def second_minimum(R_base_flange: Array, parameters: Parameters = NOMINAL) -> tu
 
 def different_orientations(R_base_flange: Array) -> int:
     """Return the number of orientations that differ by more than half a degree, counted up to 24."""
-    # The first 24 poses of a usual tour all differ, which one comparison of all pairs shows.
+    # Usually the first 24 poses of a tour all differ, and then one comparison of all pairs is enough.
     kept, rest = R_base_flange[:24], R_base_flange[24:]
     pairs = np.triu_indices(len(kept), 1)
     if np.any(angle_between(kept[pairs[0]], kept[pairs[1]]) <= SAME_ORIENTATION_RAD):
@@ -256,8 +256,8 @@ def _ambiguities(
         )
     if observability.rank == 15 and observability.condition <= POOR_CONDITION:
         return (
-            "a very different mounting of the sensor explains these poses almost as well if the tool is light "
-            f"(gap {observability.second_gap:.2g}, {WEAK_GAP:g} is sound)",
+            "a very different mounting of the sensor explains these poses almost as well if the tool is light (gap "
+            f"{observability.second_gap:.2g}, at least {WEAK_GAP:g} is sound)",
         )
     share = (weak**2).sum(axis=1).reshape(5, 3).sum(axis=1) / weak.shape[1]
     names = ", ".join(name for name, part in zip(_GROUPS, share, strict=True) if part > 0.05)

@@ -245,7 +245,7 @@ def _join(
         return solved.cost - alone, prior.count(kept), load.static
 
     misfit, words = solved.cost - alone, "calibrate this tool alone, without --from"
-    contradiction = prior.contradiction(misfit, prior.count(WHOLE), refit, "the rows of the recording", words)
+    contradiction = prior.contradiction(misfit, prior.count(WHOLE), refit, "the data of the recording", words)
     return load, effects, solved, contradiction
 
 

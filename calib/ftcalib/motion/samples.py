@@ -67,7 +67,7 @@ _PARTS = 200
 # Interval between rows, a multiple of `MEAN_S`. The bandwidth of 4.7 Hz is below gear ripple and arm vibration, and
 # above the motion of the arm. A contact affects only a few such rows.
 WIDE_S = 0.12
-# Interval for a bandwidth of 2 Hz: gears of slowly turning joints shake the tool at 2 to 5 Hz.
+# Interval for a bandwidth of 2 Hz: gears of slowly rotating joints shake the tool at 2 to 5 Hz.
 NARROW_S = 0.28
 
 
@@ -233,15 +233,15 @@ class Means:
             raise BadDataset("a time or a value is not a finite number: remove these samples")
         if (bad := np.flatnonzero((np.abs(t_s) > LATEST_S) | (np.abs(values) > LARGEST).any(axis=1))).size:
             raise BadDataset(
-                f"sample {self.samples + bad[0] + 1} at {t_s[bad[0]]:.6g} s has {np.abs(values[bad[0]]).max():.3g}, "
-                "more than any device reports: remove this sample"
+                f"sample {self.samples + bad[0] + 1} at {t_s[bad[0]]:.6g} s has the value "
+                f"{np.abs(values[bad[0]]).max():.3g}, more than any device reports: remove this sample"
             )
         steps = np.diff(t_s, prepend=self._last_s if self.samples else t_s[0])
         if steps[longest := int(steps.argmax())] > LONGEST_GAP_S:
             require_seconds(t_s, "the times")
             raise BadDataset(
                 f"no sample for {steps[longest]:.3g} s before sample {self.samples + longest + 1} at "
-                f"{t_s[longest]:.6g} s: divide the recording there, or correct the times"
+                f"{t_s[longest]:.6g} s: split the recording there, or correct the times"
             )
         self._last_s, self.samples = float(t_s[-1]), self.samples + len(t_s)
         before = np.floor(t_s / MEAN_S)
@@ -370,7 +370,7 @@ def motion_rows(
     count = int((last - first) / MEAN_S) - 2 * reach
     if count < 1 / MEAN_S:
         raise BadDataset(
-            f"wrench and poses overlap by {max(last - first, 0):.1f} s: give files of one recording, on one clock"
+            f"wrench and poses overlap by only {max(last - first, 0):.1f} s: give files of one recording, on one clock"
         )
     poses = t_p, np.hstack([_continuous_quaternions(poses[1]), poses[1][:, 9:]])
     parts = [

@@ -257,7 +257,7 @@ def _coarse_delay(rows: MotionRows) -> tuple[float, float]:
     The delay is searched in whole rows. The residual is relative to the standard deviation of each channel.
     """
     if len(rows) * rows.row_s < LEAST_S:
-        raise BadDataset(f"only {len(rows) * rows.row_s:.1f} s of motion have no gap: record 20 s or more")
+        raise BadDataset(f"only {len(rows) * rows.row_s:.1f} s of motion are free of gaps: record 20 s or more")
     index = np.round((rows.t_s - rows.t_s[0]) / rows.row_s).astype(np.int64)
     place = np.full(index[-1] + 1, -1)
     place[index] = np.arange(len(rows))

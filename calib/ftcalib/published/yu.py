@@ -212,7 +212,7 @@ class _Match:
         strays = np.flatnonzero(self.number < 0)
         if strays.size:
             problems.append(f"row {_list(strays)} not among them ({self._worst(strays)})")
-        advice = "Use LROM or ML" if self.seen < 24 else "Use mixed, which takes further poses, LROM or ML"
+        advice = "Use LROM or ML" if self.seen < 24 else "Use mixed, which accepts additional poses, or LROM or ML"
         return f"SROM needs its 24 orientations once each: {'; '.join(problems)}. {advice} instead."
 
     def refusal_of_mixed(self) -> str:

@@ -36,7 +36,7 @@ _LATE_FRAMES = 32
 _QUIET_S = 0.01
 # If the halves of a reading arrive in the wrong order, further frames are awaited for this time.
 _STRAGGLER_S = 0.004
-_ANOTHER_SLOT = "choose another slot, slot=0 to 15 in its address"
+_ANOTHER_SLOT = "choose another slot, with slot=0 to 15 in its address"
 # Counts per unit of firmware that does not report them, according to the manual.
 _MILLION = (1_000_000, 1_000_000)
 # Shortest poll period: about the capacity of a bus at 250 kbit/s. Faster polls would only load the CPU.
@@ -208,7 +208,7 @@ class AtiCanSensor(StreamingSensor):
         echo = codec.decode_slot(*self._ask(Op.SELECT_SLOT, self._slot))
         if echo != self._slot:
             raise ConnectError(
-                f"{self.name}: requested calibration slot {self._slot}, the sensor selected {echo}",
+                f"{self.name}: requested calibration slot {self._slot}, but the sensor selected {echo}",
                 f"end other programs that use the sensor, or {_ANOTHER_SLOT}",
             )
 
@@ -240,8 +240,8 @@ class AtiCanSensor(StreamingSensor):
         configured = self._counts_per_unit or counts, self._unit_codes or unit_codes
         if configured != (counts, unit_codes):
             raise ConnectError(
-                f"{self.name}: the sensor reports {_scale_text(counts, unit_codes)}, configured are "
-                f"{_scale_text(*configured)}",
+                f"{self.name}: the sensor reports {_scale_text(counts, unit_codes)}, but {_scale_text(*configured)} "
+                "are configured",
                 "check slot, units and counts in its address",
             )
         return counts, unit_codes, "device"
@@ -257,7 +257,7 @@ class AtiCanSensor(StreamingSensor):
                 f"{self.name}: the sensor has reset itself and may be back at calibration slot 0", "open it again"
             )
         if new := status & ~self._seen_status:
-            log.warning("%s: status %s; measuring continues", self.name, describe_status(new, codec.STATUS_BITS))
+            log.warning("%s: status %s; measurement continues", self.name, describe_status(new, codec.STATUS_BITS))
             self._seen_status |= new
         refuse_saturated(self.name, reading.gauges[np.newaxis])
 

@@ -119,7 +119,7 @@ def decode_counts_per_unit(data: bytes) -> tuple[int, int]:
     """Decode counts per unit of force and of torque."""
     force, torque = _unpack(">II", data, "counts per unit")
     if not force or not torque:
-        raise ProtocolError(f"counts per unit are {force} and {torque}, and must be positive")
+        raise ProtocolError(f"counts per unit must be positive, but are {force} and {torque}")
     return force, torque
 
 
@@ -173,7 +173,7 @@ def unit_names(unit_codes: tuple[int, int]) -> tuple[str, str]:
     """Return the names of the units of force and torque. Raises `ProtocolError` for unknown codes."""
     force, torque = unit_codes
     if not (1 <= force <= len(_FORCES) and 1 <= torque <= len(_TORQUES)):
-        raise ProtocolError(f"unit codes are {force} (force) and {torque} (torque), known are 1 to 6")
+        raise ProtocolError(f"unit codes are {force} (force) and {torque} (torque), but only 1 to 6 are known")
     return _FORCES[force - 1], _TORQUES[torque - 1]
 
 
@@ -237,4 +237,4 @@ def refuse_saturated(name: str, gauges: NDArray[np.int32]) -> None:
     saturated = np.flatnonzero(((gauges == _LOWEST) | (gauges == _HIGHEST)).any(axis=0))
     if len(saturated):
         names = ", ".join(f"G{gauge}" for gauge in saturated)
-        raise DeviceFault(f"{name}: gauge {names} is at the end of its range", "take the load off, check the cable")
+        raise DeviceFault(f"{name}: gauge {names} is at the end of its range", "remove the load and check the cable")

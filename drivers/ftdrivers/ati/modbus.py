@@ -109,7 +109,7 @@ def decode_calibration_block(data: bytes) -> _CalibrationBlock:
     matrix = np.frombuffer(data, ">f4", 36, offset=2 * 32).reshape(6, 6)
     force, torque = struct.unpack_from(">ii", data, 2 * 117)
     if not np.isfinite(matrix).all() or force <= 0 or torque <= 0:
-        raise ProtocolError(f"the slot is empty, with counts per unit {force} and {torque}")
+        raise ProtocolError(f"the slot is empty: its counts per unit are {force} and {torque}")
     return _CalibrationBlock(
         serial=decode_text(data[0:8]),
         part_number=decode_text(data[8:40]),

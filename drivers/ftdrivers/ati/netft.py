@@ -72,7 +72,7 @@ NET_FT_BITS = {
     20: "RDT",
     21: "CAN",
     22: "network",
-    23: "configuration does not fit the calibration",
+    23: "configuration does not match the calibration",
     24: "settings invalid",
     25: "halted by a configuration error",
     26: "program memory",
@@ -357,7 +357,7 @@ class NetFtSensor(StreamingSensor):
         if status not in {0, MONITOR_LATCHED}:
             raise DeviceFault(f"{self.name}: status {describe_status(status, self._bits, 32)}", UNUSABLE)
         if status and not self._warned:
-            log.warning("%s: status %s; measuring continues", self.name, describe_status(status, self._bits, 32))
+            log.warning("%s: status %s; measurement continues", self.name, describe_status(status, self._bits, 32))
             self._warned = True
 
     def _read_page(self, path: str) -> bytes:

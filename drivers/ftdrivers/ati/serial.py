@@ -92,7 +92,7 @@ class AtiSerialSensor(StreamingSensor):
         except ProtocolError as exc:
             raise ProtocolError(
                 f"{self.name}: calibration slot {self._calibration_index}: {exc.found}",
-                "choose another slot, calibration=1 to 16 in its address",
+                "choose another slot, with calibration=1 to 16 in its address",
             ) from exc
         self._set_gauges(block.gains, block.offsets)
         self._start_stream()
@@ -181,7 +181,7 @@ class AtiSerialSensor(StreamingSensor):
                     "check parity and wiring, power it off and on",
                 )
             log.warning(
-                "%s: a record with its error bit set, but the status is %s; measuring continues", self.name, text
+                "%s: a record with its error bit set, but the status is %s; measurement continues", self.name, text
             )
         self._start_stream()
         self._slipped = False
@@ -215,7 +215,7 @@ class AtiSerialSensor(StreamingSensor):
             raise ProtocolError(
                 f"{self.name}: no intact record after {_MAX_RESTARTS} restarts of the stream", "check parity and wiring"
             )
-        log.warning("%s: the stream has slipped; restarting it", self.name)
+        log.warning("%s: the stream has lost its alignment; restarting it", self.name)
         self._judge_status(self._stop_stream())
         self._start_stream()
         self._slipped = False
@@ -240,7 +240,7 @@ class AtiSerialSensor(StreamingSensor):
         if self._seq and new & modbus.WATCHDOG_RESET:
             raise StreamBroken(f"{self.name}: the sensor has reset itself and lost its gains", "open it again")
         if new:
-            log.warning("%s: status %s; measuring continues", self.name, text)
+            log.warning("%s: status %s; measurement continues", self.name, text)
 
 
 def _streams(data: bytes) -> bool:

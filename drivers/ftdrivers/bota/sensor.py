@@ -100,7 +100,7 @@ class BotaSensor(StreamingSensor):
         times = [frame.t_us for frame in self._find()]
         self._period_us = median((b - a) % _CLOCK for a, b in pairwise(times))
         if not self._period_us:
-            raise ConnectError(f"{self.name}: the sensor's clock stands still at {times[-1]} µs", "power it off and on")
+            raise ConnectError(f"{self.name}: the sensor's clock is stuck at {times[-1]} µs", "power it off and on")
         self._nominal_Hz = 1e6 / self._period_us
         self._t_us = times[-1]
         self._seq = 0
@@ -155,7 +155,7 @@ class BotaSensor(StreamingSensor):
                 port.close()
         fix = other_baud(codec.DEFAULT_BAUD) if has_noise else "check supply and wiring"
         if self._sinc is None:
-            fix += "; add sinc=512 to its address if it is in set-up or text mode"
+            fix += "; if the sensor is in set-up or text mode, add sinc=512 to its address"
         raise ConnectError(f"{self.name}: {', '.join(found)}", fix)
 
     def _configure(self, baud: int, sinc: int) -> None:
@@ -215,9 +215,9 @@ class BotaSensor(StreamingSensor):
             found = f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}"
             if status & codec.RAW:
                 raise DeviceFault(f"{found}, samples are not in N", "add ?sinc=512 to its address")
-            raise DeviceFault(found, "take the load off, check the cable")
+            raise DeviceFault(found, "remove the load and check the cable")
         if new := status & ~self._seen_status:
-            log.warning("%s: status %s; measuring continues", self.name, describe_status(new, codec.STATUS_BITS))
+            log.warning("%s: status %s; measurement continues", self.name, describe_status(new, codec.STATUS_BITS))
             self._seen_status |= new
 
 

@@ -121,7 +121,7 @@ class RobotiqUrcap(StreamingSensor):
             return NOTHING
         wrench = np.array([values for _, values in readings])
         if (np.abs(wrench) >= _END).any():
-            raise DeviceFault(f"{self.name}: a value is at the end of its range", "take the load off, check the cable")
+            raise DeviceFault(f"{self.name}: a value is at the end of its range", "remove the load and check the cable")
         return FtSamples.of(t_host_ns, [number for number, _ in readings], wrench)
 
     def _disconnect(self) -> None:
@@ -186,7 +186,7 @@ class RobotiqFt300(StreamingSensor):
         host, written = _host_and_port(address)
         port = options.integer("port", PORT if written is None else written, 1, 65535)
         if written not in {None, port}:
-            raise ValueError(f"it has two ports, {written} and {port}; leave one out")
+            raise ValueError(f"the address has two ports, {written} and {port}; leave one out")
         return RobotiqUrcap(host, port=port, sign=sign, clock=clock)
 
     def _connect(self) -> DeviceInfo:
@@ -215,7 +215,7 @@ class RobotiqFt300(StreamingSensor):
             return NOTHING
         counts = np.array([codec.decode_frame(frame) for _, frame in frames], np.int32)
         if (np.abs(counts + 0.5) > 32767).any():
-            raise DeviceFault(f"{self.name}: a value is at the end of its range", "take the load off, check the cable")
+            raise DeviceFault(f"{self.name}: a value is at the end of its range", "remove the load and check the cable")
         return FtSamples.of(t_host_ns, [number for number, _ in frames], counts / codec.COUNTS_PER_UNIT, counts=counts)
 
     def _disconnect(self) -> None:

@@ -244,7 +244,7 @@ class RobotousCan(RobotousSensor):
 
     def _silence_fix(self) -> str:
         if self._heard_ns is not None and self._clock.now_ns() - self._heard_ns < _HEARD_S * 1e9:
-            return "reduce the load of this computer, because frames are read too late to be paired"
+            return "reduce the load on this computer, because frames are read too late to be paired"
         return super()._silence_fix()
 
     def _receive(self) -> list[Field]:
@@ -271,6 +271,6 @@ def _parse_ids(text: str) -> tuple[int, int, int]:
         command = first = second = 0
     if not all(0 <= number <= 0x7FF for number in (command, first, second)) or len({command, first, second}) < 3:
         raise ValueError(
-            f"ids are '{text}'; give three identifiers, of commands and of both response frames, such as 0xF0,0xF1,0xF2"
+            f"ids are '{text}'; give three identifiers, for commands and both response frames, such as 0xF0,0xF1,0xF2"
         )
     return command, first, second

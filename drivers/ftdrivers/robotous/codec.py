@@ -114,7 +114,7 @@ def decode_rate(field: bytes) -> int:
     for rate_Hz, code in RATE_CODES.items():
         if field[1] in {code, 0} and (field[1] or rate_Hz == 200):
             return rate_Hz
-    raise ProtocolError(f"the sensor reports output rate code {field[1]}, known are 0 to 8", "power it off and on")
+    raise ProtocolError(f"the sensor reports output rate code {field[1]}, not 0 to 8", "power it off and on")
 
 
 def check_set(field: bytes) -> None:
@@ -144,7 +144,7 @@ def counts_per_unit(model: str) -> tuple[int, int]:
     """Return counts per N and per N·m of a model such as ``RFT60-HA01``; a code of the wire may follow the name."""
     counts = _COUNTS_PER_N_NM.get(model[:10])
     if counts is None:
-        found = f"the scale of model '{model}' is unknown, known are those of {', '.join(_COUNTS_PER_N_NM)}"
+        found = f"the scale of model '{model}' is unknown; known models are {', '.join(_COUNTS_PER_N_NM)}"
         raise ProtocolError(found, "ask Robotous for its dividers DF and DT, then add counts=DF,DT to its address")
     return counts
 

@@ -117,7 +117,7 @@ class RobotousSensor(StreamingSensor):
         overload = np.array([sample.overload for sample in samples], np.uint32)
         if axes := codec.overloaded_axes(int(np.bitwise_or.reduce(overload))):
             raise DeviceFault(
-                f"{self.name}: overload of {', '.join(axes)}", "take the load off, then check the zero of the sensor"
+                f"{self.name}: overload of {', '.join(axes)}", "remove the load, then check the zero of the sensor"
             )
         counts = np.array([sample.counts for sample in samples], np.int32)
         return FtSamples.of(

@@ -108,7 +108,7 @@ class Ros2Arm(ReadOnlyArm):
             if self._failure is not None:
                 raise ConnectError(self._failure.found, self._failure.fix) from self._failure
             if self._newest is None:
-                raise ConnectError(self._reader.missing(), "check topic, frames and that the driver of the arm runs")
+                raise ConnectError(self._reader.missing(), "check topic and frames, and that the driver is running")
 
     def close(self) -> None:
         """Leave the ROS graph. Followers raise `StreamBroken`."""
@@ -143,7 +143,7 @@ class Ros2Arm(ReadOnlyArm):
                     if t_s < newest.t_device_s - _BACK_S:
                         self._failure = ProtocolError(
                             f"the stamps of {topic} went back by {newest.t_device_s - t_s:.1f} s",
-                            "check that one node publishes it, with one clock",
+                            "check that only one node publishes it, with one clock",
                         )
                     continue
                 self._newest = state = self._state_of(pose, received.t_host_ns)
@@ -213,7 +213,7 @@ class Ros2Arm(ReadOnlyArm):
     def _silence(self) -> DeviceTimeout:
         return DeviceTimeout(
             f"{self._host}: no new pose for {self._age_s():.2f} s (allowed: {_STALE_S:g} s)",
-            "check that the driver of the arm runs",
+            "check that the driver of the arm is running",
         )
 
     def diagnose(self) -> list[Diagnosis]:
@@ -247,7 +247,7 @@ def pose_reader_of(host: str) -> PoseReader:
     options = Options(host, parts.query)
     address = parts.address.strip("/")
     if not address:
-        raise BadUrl(f"{host}: names no topic; write it like ros2:/pose_topic or ros2:tf?base=base&flange=tool0")
+        raise BadUrl(f"{host} names no topic; write it like ros2:/pose_topic or ros2:tf?base=base&flange=tool0")
     base, flange = options.optional("base"), options.optional("flange")
     urdf = options.optional("urdf")
     options.reject_others()
@@ -260,5 +260,5 @@ def pose_reader_of(host: str) -> PoseReader:
             raise BadUrl(f"{host}: option 'flange' is missing: the link of the flange in {urdf}")
         return Joints(f"/{address}", Chain(Path(urdf), base or "", flange))
     if base is not None or flange is not None:
-        raise BadUrl(f"{host}: base and flange go with tf or urdf; a PoseStamped is the flange in the base")
+        raise BadUrl(f"{host}: base and flange apply only to tf and urdf; a PoseStamped is already the flange pose")
     return Poses(f"/{address}")

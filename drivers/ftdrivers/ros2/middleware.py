@@ -29,8 +29,8 @@ def ros2_module(name: str) -> Any:
     except ImportError as error:
         package = name.partition(".")[0]
         raise NoRos2(
-            f"Python cannot import {package} ({error}): source a ROS 2 (`source /opt/ros/jazzy/setup.bash`, ftdrive in "
-            f"a venv with --system-site-packages and its Python), or on Linux x86-64 `{install_command('ros2')}`"
+            f"Python cannot import {package} ({error}): source ROS 2 (`source /opt/ros/jazzy/setup.bash`, with ftdrive "
+            f"in a venv of its Python with --system-site-packages), or on Linux x86-64 `{install_command('ros2')}`"
         ) from error
 
 
@@ -154,7 +154,7 @@ def subscribe(
     Raises
     ------
     ConnectError
-        No node publishes the topic, it has another type, or the publisher only offers best effort.
+        No node publishes the topic, its type is different, or the publisher offers only best effort.
     ProtocolError
         Two nodes publish the topic.
     """
@@ -198,7 +198,7 @@ def clock_diagnosis(ros: Node, newest_s: float) -> Diagnosis:
     if -_SAME_CLOCK_MS < behind_ms < _LONGEST_WAY_MS:
         return Diagnosis("clock", True, f"the newest stamp is {behind_ms:.1f} ms old by the clock of this computer")
     where = f"{behind_ms:.0f} ms behind" if behind_ms > 0 else f"{-behind_ms:.0f} ms ahead of"
-    found = f"another clock: the stamps are {where} that of this computer; the delay is estimated from motion"
+    found = f"the stamps come from another clock, {where} that of this computer; the delay is estimated from motion"
     return Diagnosis("clock", True, found)
 
 
@@ -221,14 +221,14 @@ def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool
     if not found:
         same = [name for name, types in ros.node.get_topic_names_and_types() if kind in types and name != topic]
         others = f"topics of this type: {', '.join(same)}" if same else "no topic has this type"
-        domain = "check the name, ROS_DOMAIN_ID and that its driver runs"
+        domain = "check the name, ROS_DOMAIN_ID and that its driver is running"
         raise ConnectError(f"no node publishes {topic} ({kind}); {others}", domain)
     if kinds != [kind]:
-        raise ConnectError(f"{topic} has the type {', '.join(kinds)}, needed is {kind}", "give another topic")
+        raise ConnectError(f"{topic} has the type {', '.join(kinds)}, but {kind} is needed", "give another topic")
     OnePublisher(ros, topic, clock).check()
     best_effort = ros2_module("rclpy.qos").ReliabilityPolicy.BEST_EFFORT
     if reliable and found[0].qos_profile.reliability == best_effort:
-        raise ConnectError(f"{topic} is offered with best effort alone", "leave the option reliable out")
+        raise ConnectError(f"{topic} is published with best effort only", "leave the option reliable out")
     return names[0]
 
 

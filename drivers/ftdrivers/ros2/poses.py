@@ -68,7 +68,7 @@ class Chain:
             self._joints.insert(0, joints[link])
             link = joints[link].parent
         if base and link != base:
-            raise BadUrl(f"{path}: {flange} is not a descendant of {base}: exchange both, or give another base")
+            raise BadUrl(f"{path}: {flange} is not a descendant of {base}: swap the two, or give another base")
         self.names = [joint.name for joint in self._joints if joint.kind in _MOVES]
         if not self.names:
             raise BadUrl(f"{path}: no joint moves between {base or link} and {flange}: give other links")
@@ -268,5 +268,5 @@ class Transforms:
             if frame in self._parts and frame != self._base:
                 frame = self._parts[frame][0]
         if frame != self._base:
-            return f"tf does not connect {self._base} with {self._flange}: nothing is above {frame}"
-        return f"no transform between {self._base} and {self._flange} moves, so none has a time"
+            return f"tf does not connect {self._base} with {self._flange}: {frame} has no parent"
+        return f"all transforms between {self._base} and {self._flange} are static, so none has a time"

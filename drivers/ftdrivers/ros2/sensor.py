@@ -125,4 +125,4 @@ class Ros2Sensor(StreamingSensor):
         return [topic, *([clock_diagnosis(self._ros, float(newest.t_device_s[0]))] if self._ros else [])]
 
     def _silence_fix(self) -> str:
-        return "check that its driver runs"
+        return "check that its driver is running"

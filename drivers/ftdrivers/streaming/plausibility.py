@@ -54,8 +54,8 @@ class Liveness:
         enough = most if math.isnan(nominal_Hz) else min(most, max(fewest, _FROZEN_S * nominal_Hz))
         if self._same_rows >= enough and same_s >= _FROZEN_S:
             raise Frozen(
-                f"{self._name}: frozen, {self._same_rows} identical samples in {same_s:.2f} s, although a sensor that "
-                "measures has noise",
+                f"{self._name}: frozen, {self._same_rows} identical samples in {same_s:.2f} s, although every "
+                "measurement has noise",
                 "power it off and on",
             )
 
@@ -127,7 +127,7 @@ class Rate:
         error = abs(rate_Hz / nominal_Hz - 1)
         if self._is_wrong and error < _RATE_TOLERANCE / 2:
             self._is_wrong = False
-            return f"rate {rate_Hz:.1f} Hz, right again"
+            return f"rate {rate_Hz:.1f} Hz, correct again"
         if not self._is_wrong and error > _RATE_TOLERANCE:
             self._is_wrong = True
             log.warning("%s: %.1f Hz instead of %g Hz; %s", self._name, rate_Hz, nominal_Hz, self._fix(rate_Hz))

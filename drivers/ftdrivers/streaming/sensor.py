@@ -318,7 +318,7 @@ class StreamingSensor(ForceTorqueSensor):
         facts = info.facts | reported | self.configured | {"sign": Fact(self._sign, "configured")}
         if reported and facts["serial"].value != info.serial:
             raise ConnectError(
-                f"{self.name}: the device reports serial number {info.serial}, {facts['serial'].value} is configured",
+                f"{self.name}: the device has serial number {info.serial}, but {facts['serial'].value} is configured",
                 "check the address and its option serial",
             )
         serial = str(facts["serial"].value) if "serial" in facts else info.serial
@@ -563,7 +563,7 @@ class StreamingSensor(ForceTorqueSensor):
         found = f"{self.name}: no new sample for {age_s:.3f} s (allowed: {self._limits.stale_s:g} s)"
         if self._was_away(self._clock.awake_s() - self._turn_s) or not self._is_back:
             return DeviceTimeout(
-                f"{found}, because this program or computer was suspended or too busy", "try again with less load"
+                f"{found}, because this program or computer was suspended or too busy", "reduce its load and try again"
             )
         return DeviceTimeout(found, self._silence_fix())
 
@@ -574,7 +574,7 @@ class StreamingSensor(ForceTorqueSensor):
     def _rate_fix(self, rate_Hz: float) -> str:
         """Return what the user should do if the rate is not nominal; a subclass may be more specific."""
         cause = "lost" if rate_Hz < self._nominal_Hz else "duplicated"
-        return f"look at health() for {cause} samples, and check the rate that is set in the sensor"
+        return f"check health() for {cause} samples, and check the rate that is set in the sensor"
 
     def _raise_failure(self) -> None:
         # Each call raises a copy, because a raised exception accumulates its traceback.

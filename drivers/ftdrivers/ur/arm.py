@@ -293,8 +293,8 @@ class UrArm(RobotArm):
         takes_inertia = version >= (5, 10)
         if any(inertia) and not takes_inertia:
             raise DeviceFault(
-                "PolyScope {}.{} accepts no inertia of the payload from a program".format(*version),
-                "set the payload at the pendant",
+                "PolyScope {}.{} does not accept the inertia of the payload from a program".format(*version),
+                "set the payload on the pendant",
             )
         self._set("payload", mass, com, inertia if takes_inertia else None)
 
@@ -412,7 +412,7 @@ class UrArm(RobotArm):
             raise DeviceTimeout(
                 f"this program did not watch the move for {self._timing.unwatched_s} s, so its control path "
                 "stopped the arm",
-                "keep the computer awake and give it less to do, then move again",
+                "keep the computer awake and reduce its load, then move again",
             )
         return bool(ended)
 
@@ -423,7 +423,7 @@ class UrArm(RobotArm):
             if self._clock.now_s() > deadline_s:
                 raise self._fault() or DeviceFault(
                     f"the move ended at {_degrees(look.target_q_rad)} instead of {_degrees(q)}",
-                    "read the reason at the pendant",
+                    "read the reason on the pendant",
                 )
             look = self._reading().look()
 
@@ -563,9 +563,9 @@ class UrArm(RobotArm):
                 control.end_reason()
                 or self._fault()
                 or DeviceFault(
-                    f"the control program on {self._host} does not answer: another program may be running, or "
-                    "controller or computer are overloaded",
-                    "check the program at the pendant, then open the arm again",
+                    f"the control program on {self._host} does not answer: another program may be running, or the "
+                    "controller or this computer is overloaded",
+                    "check the program on the pendant, then open the arm again",
                 )
             )
 
@@ -580,7 +580,7 @@ class UrArm(RobotArm):
             self._program.is_gone()  # another program has probably replaced it
             return False
         except DeviceError as error:
-            log.info("%s: the control program cannot be asked: %s", self._host, error)
+            log.info("%s: the control program cannot be queried: %s", self._host, error)
             return False
         return True
 

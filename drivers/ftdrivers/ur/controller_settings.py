@@ -65,7 +65,7 @@ def checked_payload(
     """Return mass, centre of mass and inertia as ur_rtde expects them. Raises `ValueError` if they are invalid."""
     mass, com, inertia = float(mass_kg), [*map(float, p_flange_com_m)], [*map(float, inertia_kg_m2)]
     if not 0 <= mass < math.inf:
-        raise ValueError(f"mass_kg is {mass_kg}; give a number from 0 on.")
+        raise ValueError(f"mass_kg is {mass_kg}; give 0 or more.")
     if len(com) != 3 or not all(map(math.isfinite, com)):
         raise ValueError(f"p_flange_com_m is {com}; give three finite numbers in metres.")
     if len(inertia) != 6 or not all(abs(one) <= _LARGEST_INERTIA_KG_M2 for one in inertia) or min(inertia[:3]) < 0:
@@ -81,5 +81,5 @@ def checked_gravity(up_base_m_s2: Sequence[float]) -> list[float]:
     """Return gravity in the form that ur_rtde expects. Raises `ValueError` if it is invalid."""
     up = [*map(float, up_base_m_s2)]
     if len(up) != 3 or not _G_M_S2[0] <= math.hypot(*up) <= _G_M_S2[1]:
-        raise ValueError(f"up_base_m_s2 is {up}; give three numbers, about 9.82 m/s² away from the earth.")
+        raise ValueError(f"up_base_m_s2 is {up}; give a vector of about 9.82 m/s² that points away from the earth.")
     return up

@@ -45,7 +45,7 @@ class Kinematics:
         """
         theta, a, d, alpha = np.array(numbers, np.float64).reshape(4, 6)
         if not np.isfinite([theta, a, d, alpha]).all() or max(abs(a[5]), abs(alpha[5])) > _ROUNDED:
-            raise ValueError(f"theta, a, d and alpha are {[*numbers]}: give finite ones, a6 and alpha6 zero.")
+            raise ValueError(f"theta, a, d and alpha are {[*numbers]}: give finite numbers, with a6 and alpha6 zero.")
         a[5] = alpha[5] = 0.0
         for joint, right in enumerate(_ALPHA_RAD):
             if alpha[joint] * right < 0:  # the same arm, with the x axis of this frame reversed

@@ -166,9 +166,9 @@ class Opening:
 
         path, why = path_for(self.setting, self.reader.version)
         stops = (
-            "; its program begins to brake within 0.3 s if computer or network fail"
+            "; its program begins to brake within 0.3 s if the computer or the network fails"
             if path == "script"
-            else "; if computer and network fail, the arm finishes its current move"
+            else "; if the computer or the network fails, the arm finishes its current move"
         )
         version = "PolyScope {}.{} can be controlled".format(*self.reader.version)
         free = "the RTDE registers are free: no other client controls the arm"
@@ -252,9 +252,9 @@ class Opening:
             if self.clock.now_s() > deadline_s:
                 program = self.reader.reported_program()
                 raise ConnectError(
-                    f"another program is on {self.host}{f' ({program})' if program else ''}, and is not stopped "
+                    f"another program is active on {self.host}{f' ({program})' if program else ''} and is not stopped "
                     "automatically",
-                    "stop it at the pendant, then start again",
+                    "stop it on the pendant, then start again",
                 )
 
 
@@ -262,6 +262,6 @@ def _refusal(host: str, path: ControlPath, error: DeviceError) -> ConnectError:
     """Return the error of a control path that did not start, with a fix."""
     return ConnectError(
         f"{path} cannot control {host}: {error.found}",
-        "check at the pendant that it is in remote control, that no dialog is open, and that no other program starts "
+        "check on the pendant that it is in remote control, that no dialog is open, and that no other program starts "
         "automatically or uses the RTDE registers, such as EtherNet/IP",
     )

@@ -275,7 +275,7 @@ class Reader:
         off = f"the flange of {self._host} is {1e3 * distance_m:.1f} mm and {math.degrees(angle_rad):.2f} degrees"
         if self._fits:
             raise DeviceFault(
-                f"{off} from its last pose: the active TCP changes", "stop what sets the TCP, then read again"
+                f"{off} from its last pose: the active TCP changes", "stop whatever sets the TCP, then read again"
             )
         shares = {name: _apart_as_share(flange, forward(nominal, q_rad)) for name, nominal in MODELS.items()}
         nearest = min(shares, key=shares.__getitem__)
@@ -291,7 +291,7 @@ class Reader:
             )
         if not fits:
             raise DeviceFault(
-                f"{off} from the pose by the kinematics that the controller sends, so that the two contradict",
+                f"{off} from the pose that follows from the kinematics sent by the controller: the two disagree",
                 "restart the controller; if that does not help, have the arm calibrated again",
             )
         self._fits = True
@@ -362,16 +362,16 @@ class Reader:
             return DeviceTimeout(
                 f"no sample of {self._host} was read for {silent_s:.2f} s, because this program or computer was "
                 "suspended or too busy",
-                "try again with less load, and press the emergency stop if the arm moves",
+                "reduce the load on this computer, then try again; press the emergency stop if the arm moves",
             )
         if self._late_s > self._timing.late_s and self._clock.awake_s() - self._read_s < silent_s:
             return DeviceTimeout(
                 f"samples of {self._host} arrive {self._late_s:.2f} s late by the controller's clock",
-                "check the network and the load of the controller, and press the emergency stop if the arm moves",
+                "check the network and the load on the controller, and press the emergency stop if the arm moves",
             )
         at = "" if math.isnan(self._t_device_s) else f" at {self._t_device_s:.3f} s"
         return DeviceTimeout(
-            f"the clock of {self._host} has stood still{at} for {silent_s:.2f} s",
+            f"the clock of {self._host} has been stuck{at} for {silent_s:.2f} s",
             "check the robot and the network, and press the emergency stop if the arm moves",
         )
 

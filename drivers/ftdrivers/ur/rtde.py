@@ -329,11 +329,11 @@ class Subscription:
 def _fix_of(error: OSError, host: str) -> str:
     if isinstance(error, ConnectionRefusedError):
         return (
-            f"check that {host} is the robot controller, switched on and started; enable RTDE at the pendant under "
+            f"check that {host} is the robot controller, switched on and started; enable RTDE on the pendant under "
             "Settings, Security, Services"
         )
     if isinstance(error, socket.gaierror):
-        return "give the controller's IPv4 address: at the pendant, Settings, System, Network shows it"
+        return "give the controller's IPv4 address: on the pendant, Settings, System, Network shows it"
     return f"ping {host}; check that the controller is switched on, its cable, and firewalls between"
 
 
@@ -439,4 +439,4 @@ class ProgramRegisters:
                 number, command = (int(np.asarray(values[name])[-1]) for name in self._names)
                 self._request = number, command
         except (OSError, StreamBroken, ProtocolError, struct.error) as error:
-            self._failure = StreamBroken(f"the registers of the controller are lost ({error})", "check robot and cable")
+            self._failure = StreamBroken(f"the controller's registers were lost ({error})", "check robot and cable")

@@ -82,25 +82,25 @@ _SAFETY_MODES: Final = {
     20: "PROFIsafe emergency stop",
     22: "safety API safeguard stop",
 }
-_ENABLING: Final = "hold the enabling device in its middle position, or switch to automatic mode at the pendant"
+_ENABLING: Final = "hold the enabling device in its middle position, or switch to automatic mode on the pendant"
 # Fixes for safety modes whose source is not shown by the status bits.
 _MODE_FIXES: Final = {
     12: "close the safeguard of automatic mode and reset it",
     13: _ENABLING,
     14: _ENABLING,
-    15: "release the emergency stop of the moulding machine, then power the arm on at the pendant",
+    15: "release the emergency stop of the moulding machine, then power the arm on from the pendant",
     16: "close the safeguard of the moulding machine and reset it",
     17: "start the safety PLC, and check its PROFIsafe connection",
     18: "clear the safeguard stop of automatic mode in the safety PLC",
     19: "clear the safeguard stop in the safety PLC",
-    20: "clear the emergency stop in the safety PLC, then power the arm on at the pendant",
+    20: "clear the emergency stop in the safety PLC, then power the arm on from the pendant",
     22: "clear the stop in the program that uses the safety API",
 }
 _SAFETY: Final = (  # the first row whose bits are set is the most specific one
-    (0b0_1110_0000, "emergency stop", "make the cell safe, release the button, power the arm on at the pendant"),
-    (0b0_0000_0100, "protective stop", "find and remove its cause, then clear it at the pendant"),
+    (0b0_1110_0000, "emergency stop", "make the cell safe, release the button, power the arm on from the pendant"),
+    (0b0_0000_0100, "protective stop", "find and remove its cause, then clear it on the pendant"),
     (0b0_0001_0000, "safeguard stop", "close the safeguard and reset it"),
-    (0b0_0000_1000, "recovery mode", "move the arm back inside its limits at the pendant"),
+    (0b0_0000_1000, "recovery mode", "move the arm back inside its limits from the pendant"),
     (0b11_0000_0000, "safety violation or fault", "read the pendant's log and restart the arm"),
     (0b100_0000_0000, "stop for a safety reason", "read the pendant's log"),
 )
@@ -169,7 +169,7 @@ class Sample:
         if self.robot_mode != ROBOT_RUNNING:
             mode = _ROBOT_MODES.get(self.robot_mode, "unknown")
             fix = "release its brakes" if self.robot_mode == ROBOT_IDLE else "power the arm on and release its brakes"
-            return DeviceFault(f"robot mode {self.robot_mode} ({mode})", f"{fix} at the pendant")
+            return DeviceFault(f"robot mode {self.robot_mode} ({mode})", f"{fix} on the pendant")
         return None
 
     def program_fault(self) -> DeviceFault | None:
@@ -179,7 +179,7 @@ class Sample:
         state = f"(state {self.program_state}, {_PROGRAM_STATES.get(self.program_state, 'unknown')})"
         if self.program_state <= PROGRAM_STOPPED:
             return DeviceFault(
-                f"the control program has ended {state}: by itself, or stopped from outside", "read the pendant's log"
+                f"the control program ended by itself or was stopped from outside {state}", "read the pendant's log"
             )
         return DeviceFault(
             f"the control program was stopped or paused from outside {state}", "end other programs for this arm"

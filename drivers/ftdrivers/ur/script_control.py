@@ -267,7 +267,7 @@ class ScriptControl(Control):
             if patience.is_over:
                 self.kill()
                 raise DeviceTimeout(
-                    f"the control program did not {what} within {timeout_s:.1f} s, so its heartbeat was ended",
+                    f"the control program did not {what} within {timeout_s:.1f} s, so its heartbeat was stopped",
                     "check the robot and the network, then open the arm again",
                 )
             if self._clock.now_s() - looked_s >= _LOOK_OUT_S:

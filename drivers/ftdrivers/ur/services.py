@@ -145,7 +145,7 @@ class _RobotApi:
 T = TypeVar("T")
 
 _ENABLE: Final = (
-    "enable the dashboard server at the pendant under Settings, Security, Services; if it is, restart the controller"
+    "enable the dashboard server on the pendant under Settings, Security, Services; if it is, restart the controller"
 )
 _ENABLE_API: Final = "check the address, and that PolyScope X is 10.11 or later and has finished starting"
 POLYSCOPE_X: Final = 10

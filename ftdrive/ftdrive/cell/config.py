@@ -153,16 +153,16 @@ class ToolConfig:
         reject=rules.reject_cylinders,
     )
     mass_kg: float | None = entry(
-        "approximate mass below the sensor; compared with the controller's payload and the sensor's range; it limits "
-        "the change of the wrench until six poses are taken",
+        "approximate mass below the sensor; compared with the controller's payload and the sensor's range; until six "
+        "poses are taken, it sets the limit for changes of the wrench",
         None,
         "kg",
         (0.001, 100),
         option="--tool-mass",
     )
     mass_sigma_kg: float | None = entry(
-        "standard deviation of mass_kg, if the tool was weighed on a scale; it then calibrates the gain of the sensor; "
-        "0.2 % of the mass is typical",
+        "standard deviation of mass_kg, if the tool was weighed on a scale; the mass then calibrates the gain of the "
+        "sensor; 0.2 % of the mass is typical",
         None,
         "kg",
         (0, 1),
@@ -174,8 +174,8 @@ class WorkcellConfig:
     """Base and surroundings, in base axes, mm from the centre of the base. PLACEHOLDERS until measured."""
 
     mounting: str | None = entry(
-        "floor, wall, ceiling, or the lean of the base towards -x in degrees, 90 is a wall; without it a floor is "
-        "assumed, and results with another gravity direction are not accepted as good",
+        "floor, wall, ceiling, or the tilt of the base towards -x in degrees, 90 for a wall; if it is not set, a floor "
+        "is assumed, and results with another gravity direction are not rated good",
         None,
         option="--mounting",
         reject=rules.reject_mounting,
@@ -191,7 +191,7 @@ class WorkcellConfig:
     boxes_mm: Rows = entry(
         "[x, y, z, x, y, z], two opposite corners of a box", (), "mm", option="--box", reject=rules.reject_boxes
     )
-    measured: bool = entry("set it to true when tool, planes and boxes are measured; otherwise nothing moves", False)
+    measured: bool = entry("set it to true once tool, planes and boxes are measured; until then nothing moves", False)
 
 
 _ROUTINE = {item.name: item.default for item in fields(Sampling)}
@@ -209,7 +209,7 @@ class _SamplingConfig(Sampling):
     )
     still_timeout_s: float = entry("time-out until the arm rests at a pose", _ROUTINE["still_timeout_s"], "s", (1, 600))
     attempts: int = entry(
-        "number of averages of a pose that moves or drifts; the last one is kept and marked as noisy",
+        "number of averages tried at a pose with motion or drift; the last one is kept and marked as noisy",
         _ROUTINE["attempts"],
         between=(1, 100),
     )

@@ -53,7 +53,7 @@ class EmulatedClock(Clock):
         if self._page[0] != _VERSION:
             raise ConnectError(
                 f"the clock of the emulated cell has version {self._page[0]}, not {_VERSION}",
-                "install ftdrive and its emulators in the same version",
+                "install the same version of ftdrive and its emulators",
             )
         weakref.finalize(self, os.close, self._descriptor)
         self._own = threading.local()

@@ -91,9 +91,9 @@ def _is_rows(value: Any) -> bool:
 
 _TYPES: Mapping[Any, tuple[str, Callable[[Any], bool]]] = {
     str: ("a string: put it in quotes", lambda value: isinstance(value, str)),
-    float: ("a number: give one such as 1.5, without quotes and unit", is_number),
+    float: ("a number: give one such as 1.5, without quotes or unit", is_number),
     int: (
-        "a whole number: give one such as 1, without quotes and decimal point",
+        "a whole number: give one such as 1, without quotes or decimal point",
         lambda value: isinstance(value, int) and not isinstance(value, bool),
     ),
     bool: ("true or false: give one of them, without quotes", lambda value: isinstance(value, bool)),
@@ -109,10 +109,10 @@ def _unless(fits: Callable[[Any], bool], fix: str) -> Reject:
     return lambda value: None if fits(value) else fix
 
 
-reject_empty = _unless(lambda text: bool(text.strip()), "it is empty: give a value, or leave the key out")
+reject_empty = _unless(lambda text: bool(text.strip()), "it is empty; give a value, or leave the key out")
 reject_sign = _unless({-1, 1}.__contains__, "give 1, or -1 for a sensor that reports the reaction")
 reject_height = _unless(lambda mm: not 0 < mm < 1, "the unit is mm: give the height in mm, such as 33, or 0")
-reject_store = _unless(lambda url: "://" in url, "it is not an address: give one such as sqlite:////data/store.sqlite")
+reject_store = _unless(lambda url: "://" in url, "it is not an address; give one such as sqlite:////data/store.sqlite")
 reject_control = _unless(CONTROL_SETTINGS.__contains__, f"give one of {', '.join(CONTROL_SETTINGS)}")
 reject_record = _unless(lambda s: s == 0 or s >= 3, "give 3 or more, or 0 for none: a shorter record is useless")
 
@@ -136,7 +136,7 @@ def reject_mounting(value: str) -> str | None:
         usable = value in {"floor", "wall", "ceiling"} or abs(float(value)) <= 180
     except ValueError:
         usable = False
-    return None if usable else "give floor, wall, ceiling, or the lean of the base towards -x, -180 to 180 degrees"
+    return None if usable else "give floor, wall, ceiling, or the tilt of the base towards -x, -180 to 180 degrees"
 
 
 def reject_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
@@ -149,7 +149,7 @@ def reject_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
             )
         if min(row[1] - row[0], row[2]) < _THINNEST_MM:
             return (
-                f"{list(row)} is shorter or thinner than {_THINNEST_MM:g} mm: give from, to and diameter in mm, and "
+                f"{list(row)} is shorter or thinner than {_THINNEST_MM:g} mm: give from, to and diameter in mm; use "
                 f"{_THINNEST_MM:g} mm for a thinner part"
             )
     return None
@@ -172,7 +172,7 @@ def reject_boxes(rows: Sequence[Sequence[float]]) -> str | None:
             return f"{list(row)} is not a box: give two opposite corners [x, y, z, x, y, z] in mm"
         if min(abs(row[i] - row[i + 3]) for i in range(3)) < _THINNEST_MM:
             return (
-                f"{list(row)} is thinner than {_THINNEST_MM:g} mm: give two opposite corners in mm, and "
+                f"{list(row)} is thinner than {_THINNEST_MM:g} mm: give two opposite corners in mm; use "
                 f"{_THINNEST_MM:g} mm for a thinner box"
             )
     return None

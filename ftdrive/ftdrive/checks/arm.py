@@ -41,7 +41,7 @@ RATED_KG: Final = (
 
 def check_unreachable(error: DeviceError, host: str) -> Check:
     """Return the failed check of an arm that could not be opened, with its remedy."""
-    fix = error.fix or f"ping {host}"
+    fix = error.fix or f"run ping {host}"
     if isinstance(error, ModelUnknown):
         fix = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model: one of {", ".join(MODELS)}'
     return Check("robot.reachable", "failed", error.found, fix)
@@ -94,7 +94,7 @@ def check_safety(status: ArmStatus) -> Check:
     if status.fault is not None:
         return Check("robot.safety", "failed", status.fault.found, status.fault.fix)
     if status.safety_mode != "normal":
-        fix = "check at the pendant that this mode is intended; calibrate asks for confirmation"
+        fix = "check on the pendant that this mode is intended; calibrate asks for confirmation"
         return Check("robot.safety", "warning", f"safety mode {status.safety_mode}", fix)
     return Check("robot.safety", "ok", "powered, brakes released, no stop")
 
@@ -104,16 +104,16 @@ def check_program(status: ArmStatus) -> Check:
     if status.program == "stopped":
         return Check("robot.program", "ok", "no program runs; clients that only read cannot be detected")
     found = f"a program is active on the controller ({status.program})"
-    return Check("robot.program", "warning", found, "stop it at the pendant: calibrate refuses to start beside it")
+    return Check("robot.program", "warning", found, "stop it on the pendant: calibrate refuses to start while it runs")
 
 
 def check_speed(status: ArmStatus) -> Check:
     """Check that the speed slider is high enough."""
     found = (
-        f"speed slider at {100 * status.speed_slider:.0f} %, the controller allows {100 * status.speed_scaling:.0f} %"
+        f"speed slider at {100 * status.speed_slider:.0f} %; the controller allows {100 * status.speed_scaling:.0f} %"
     )
     if status.speed_slider < SLOWEST_SLIDER:
-        fix = "raise the speed slider at the pendant, to 100 % if that is safe; ftdrive never changes it"
+        fix = "raise the speed slider on the pendant, to 100 % if that is safe; ftdrive never changes it"
         return Check("robot.speed", "failed", f"{found}: the arm would hardly move", fix)
     return Check("robot.speed", "ok", found)
 
@@ -125,9 +125,9 @@ def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) 
     """
     name, payload_kg, p_m = "robot.payload", status.payload_kg, status.p_flange_payload_m
     if payload_kg is None:
-        return Check(name, "skipped", "the controller does not report its payload: check it at the pendant")
+        return Check(name, "skipped", "the controller does not report its payload: check it on the pendant")
     if payload_kg <= 0:
-        fix = "set total mass and centre of mass below the flange at the pendant; otherwise the arm may stop itself"
+        fix = "on the pendant, set total mass and centre of mass of what the flange carries; otherwise the arm may stop"
         return Check(name, "failed", "no payload is set in the controller", fix)
     found = f"payload {payload_kg:.2f} kg"
     if p_m is None:
@@ -135,15 +135,15 @@ def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) 
     else:
         found += " at ({:.0f}, {:.0f}, {:.0f}) mm from the flange".format(*(1e3 * value for value in p_m))
         if tool.cylinders_mm and not _at_tool(p_m, tool):
-            fix = "correct the centre of mass at the pendant, or [tool] cylinders_mm"
+            fix = "correct the centre of mass on the pendant, or [tool] cylinders_mm"
             return Check(name, "failed", f"{found}, outside the tool", fix)
     if tool.mass_kg is not None:
         expected_kg = tool.mass_kg + (sensor_kg or 0.0)
-        found += f", sensor and tool weigh {expected_kg:.2f} kg"
+        found += f"; sensor and tool weigh {expected_kg:.2f} kg"
         if abs(payload_kg - expected_kg) > max(described_cell.PAYLOAD_KG, described_cell.PAYLOAD_SHARE * expected_kg):
-            return Check(name, "failed", found, "correct the payload at the pendant, or the masses in [tool], [sensor]")
+            return Check(name, "failed", found, "correct the payload on the pendant, or the masses in [tool], [sensor]")
     if p_m is not None and not any(p_m):
-        fix = "set the centre of gravity at the pendant: Installation, Payload"
+        fix = "set the centre of gravity on the pendant: Installation, Payload"
         return Check(name, "warning", f"{found}; no real payload has its centre in the flange face", fix)
     return Check(name, "ok", found)
 

@@ -100,7 +100,7 @@ def check_calibration(
     name = "calibration.devices"
     belongs = compare_devices(result, connected, mount)
     if belongs.others:
-        return Check(name, "failed", "; ".join(belongs.others), "ftdrive calibrate")
+        return Check(name, "failed", "; ".join(belongs.others), "run ftdrive calibrate")
     created = result.provenance.get("created_utc")
     made = f"verdict {result.verdict}, made at an unknown time"
     if isinstance(created, str):

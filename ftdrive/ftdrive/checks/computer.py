@@ -238,7 +238,7 @@ def check_can_interface(interface: str, bitrate: int, details: Mapping[str, Any]
         return Check(name, "failed", f"{interface} is not a CAN interface", fix)
     folder = sys / "class" / "net" / interface
     if not folder.exists():
-        fix = f"plug the adapter in (ftdrive devices lists the interfaces), then {up}"
+        fix = f"plug the adapter in (ftdrive devices lists the interfaces), then run {up}"
         return Check(name, "failed", f"there is no CAN interface {interface}", fix)
     if (folder / "type").read_text(encoding="ascii").strip() != _CAN_INTERFACE:
         return Check(name, "failed", f"{interface} is not a CAN interface", "ftdrive devices lists them")
@@ -246,7 +246,7 @@ def check_can_interface(interface: str, bitrate: int, details: Mapping[str, Any]
     if not flags & 1:
         return Check(name, "failed", f"{interface} is down", up)
     if details.get("state") == "BUS-OFF":
-        fix = f"check wiring, termination and bitrate, then sudo ip link set {interface} type can restart"
+        fix = f"check wiring, termination and bitrate, then run sudo ip link set {interface} type can restart"
         return Check(name, "failed", f"{interface} has switched off after bus errors (bus-off)", fix)
     found = details.get("bitrate")
     if found is not None and found != bitrate:

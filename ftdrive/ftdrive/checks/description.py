@@ -98,7 +98,7 @@ QUESTIONS: Final = (
     CellQuestion(
         "workcell.mounting",
         "Mounting",
-        "floor, wall, ceiling, or the lean of the base towards -x in degrees",
+        "floor, wall, ceiling, or the tilt of the base towards -x in degrees",
         _stripped,
         "floor",
         in_force=True,
@@ -145,7 +145,7 @@ class Description:
         """Warning if the arm has no measured shape; empty if it has one, or if its model is unknown."""
         if self.model is None or model_named(self.model, controller_major=0) in SHAPES:
             return ""
-        return f"the {self.model} has no measured shape, so no motion can be planned: use calibrate --manual"
+        return f"the shape of the {self.model} is not measured, so no motion can be planned: use calibrate --manual"
 
     def usual(self, question: CellQuestion) -> str | None:
         """Return the default answer to a question; None if it has none."""

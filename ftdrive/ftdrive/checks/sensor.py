@@ -85,7 +85,7 @@ def _check_scale(force: Fact | None, torque: Fact | None) -> Check:
 def _check_range(fact: Fact | None) -> Check:
     name = "sensor.range"
     if fact is None or not isinstance(fact.value, tuple):
-        fix = "add range=N,Nm of its data sheet to the sensor's address, such as range=300,30"
+        fix = "add range=N,Nm from its data sheet to the sensor's address, such as range=300,30"
         return Check(name, "warning", "range unknown: overload is not monitored", fix)
     *force, tx, ty, tz = (f"{value:g}" for value in fact.value)
     return Check(name, "ok", f"±({', '.join(force)}) N, ±({tx}, {ty}, {tz}) N·m, {_SOURCE[fact.source]}")
@@ -102,7 +102,7 @@ def _check_settings(bias: Fact | None, transformation: Fact | None) -> list[Chec
     checks = []
     if bias is not None and isinstance(bias.value, tuple) and any(bias.value):
         numbers = ", ".join(f"{value:g}" for value in bias.value)
-        found = f"the sensor subtracts its software bias ({numbers}): a change of it invalidates a calibration"
+        found = f"the sensor subtracts its software bias ({numbers}): changing it invalidates a calibration"
         checks.append(Check("sensor.bias", "ok", found))
     if transformation is not None:
         found = f"the driver undoes the tool transformation of the sensor: {transformation.value}"
@@ -174,15 +174,14 @@ def _usual_fix(error: BaseException, address: SensorAddress) -> str:
         return "look up the fault in the sensor's manual, switch the sensor off and on, then run ftdrive doctor again"
     if isinstance(error, ProtocolError):
         return f"switch the sensor off and on, and check that its address is right: {_who_answers(address)}"
-    return f"check the sensor's supply and cable, then {_who_answers(address)}"
+    return f"check the sensor's power supply and cable, then {_who_answers(address)}"
 
 
 def _who_answers(address: SensorAddress) -> str:
     if address.host is not None:
-        return f"ping {address.host}"
-    return (
-        "run ftdrive doctor again" if address.place is None else f"ftdrive devices --probe {shlex.quote(address.place)}"
-    )
+        return f"run ping {address.host}"
+    place = address.place
+    return "run ftdrive doctor again" if place is None else f"run ftdrive devices --probe {shlex.quote(place)}"
 
 
 def check_compensated(wrench: Array, cell: CellConfig) -> Check:
@@ -194,7 +193,7 @@ def check_compensated(wrench: Array, cell: CellConfig) -> Check:
     found = f"the force at rest is {force_N:.1f} N, and the tool weighs {weight_N:.1f} N"
     if force_N > _COMPENSATED * weight_N:
         return Check(name, "ok", found)
-    fix = "give the topic of the raw wrench, or disable its compensation; a constant zeroing does no harm"
+    fix = "give the topic of the raw wrench, or disable its compensation; subtracting a constant does no harm"
     return Check(name, "warning", f"{found}: the topic is already compensated or zeroed", fix)
 
 
@@ -300,7 +299,7 @@ def check_level(wrench: Array) -> Check:
     if len(wrench) < LEAST_SAMPLES:
         return Check(name, "failed", f"only {len(wrench)} samples", "check the rate of the sensor")
     if not np.isfinite(wrench).all():
-        return Check(name, "failed", "the sensor sends values that are not numbers", "check its cable and supply")
+        return Check(name, "failed", "the sensor sends values that are not numbers", "check its cable and power supply")
     if dead := [AXES[i] for i in np.flatnonzero(np.ptp(wrench, axis=0) == 0)]:
         found = f"{', '.join(dead)} did not change: the sensor is stuck"
         return Check(name, "failed", found, "switch the sensor off and on")
@@ -399,9 +398,9 @@ def check_push(
     if size_N < _PUSH_N:
         return Check("push.sign", "failed", found, f"push again with more than {_PUSH_N:g} N, and hold"), moved
     if base is None:
-        return Check("push.sign", "skipped", found, "give --calibration FILE, for the mounting"), moved
+        return Check("push.sign", "skipped", found, "give --calibration FILE, which contains the mounting"), moved
     if abs(base[0]) < 0.8 * size_N:
-        fix = "push along +X of the base; if you did, the sensor is mounted differently: ftdrive calibrate"
+        fix = "push along +X of the base; if you did, the sensor is mounted differently: run ftdrive calibrate"
         return Check("push.sign", "failed", found, fix), moved
     if base[0] < 0:
         fix = f"set sign = {-sign} under [sensor] in the configuration, then calibrate again"

@@ -131,7 +131,7 @@ HEADINGS = {
 @click.option(
     "--resume",
     type=FOLDER,
-    help="Continue an interrupted run in its mode, with its options and the present configuration files.",
+    help="Continue an interrupted run in its mode, with its options and the current configuration files.",
 )
 @click.option("--redo", type=int, multiple=True, metavar="N", help="With --resume: repeat pose N. Repeatable.")
 @YES
@@ -256,9 +256,9 @@ def refuse_contradictions(given: Mapping[str, Any]) -> None:
     for group in _EXCLUDE_ONE_ANOTHER:
         both = [option for option in group if option in given]
         if len(both) > 1:
-            raise ConfigError(f"{both[0]} and {both[1]} exclude one another: leave one of them out")
+            raise ConfigError(f"{both[0]} and {both[1]} are mutually exclusive: leave one of them out")
     if "--manual" in given and (method := given.get("--method")) in SPECIAL:
-        words = f"--manual ends before the 24 orientations that {method} needs"
+        words = f"--manual may end before all 24 orientations are taken, which {method} needs"
         raise ConfigError(f"{words}: leave it out, or choose --method lrom")
     seconds = given.get("--seconds")
     if seconds is not None and (seconds > _LONGEST_SWEEP_S if "--sweep" in given else "--passive" not in given):

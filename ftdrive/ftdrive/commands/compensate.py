@@ -28,7 +28,7 @@ from ftdrive.terminal.text import echo
 @click.option("--orientation-file", metavar="FILE", type=FILE, help="Table of the flange poses, with --wrench.")
 @BAG_TOPICS
 @TABLE
-@click.option("--delay", metavar="S|auto", help="Delay of the wrench of another program, s.  [default: auto]")
+@click.option("--delay", metavar="S|auto", help="Delay of the wrench recorded by another program, s.  [default: auto]")
 @FORCE
 @click.option(
     "--bias",
@@ -58,13 +58,13 @@ def compensate(
     """Compensate a whole recording with a calibration; no device is needed.
 
     RECORDING is a file of `ftdrive record`, compensated with its own calibration by default. Recordings of other
-    programs: a table with wrench and orientation, two tables on one clock (--wrench, --orientation-file), also with
+    programs: a table with wrench and orientation, two tables on one clock (--wrench, --orientation-file), possibly with
     different rates, or a ROS 1 or ROS 2 bag. Use --columns and the options below it for what a table does not contain.
     """
     if output is not None:
         format_of(output)
     if path is not None and (wrench is not None or orientation_file is not None):
-        raise ConfigError("RECORDING does not go with --wrench and --orientation-file: leave one of the two out")
+        raise ConfigError("RECORDING cannot be combined with --wrench and --orientation-file: leave one of the two out")
     if path is None and (wrench is None or orientation_file is None):
         raise ConfigError(_missing_input(wrench, orientation_file, calibration))
     if (wrench_topic or pose_topic) and not (path and is_bag(path)):
@@ -116,7 +116,7 @@ def _result_lines(result: dict[str, Any], frame: str) -> Iterator[str]:
     yield from (f" {MARKS[mark]}" for mark in result["marks"])
     yield f" {result['samples']} samples, {result['duration_s']:.2f} s, gaps: {result['gaps']}"
     if delay := result["delay_s"]:
-        yield f" wrench after pose: {with_sigma(1e3 * delay['value'], 1e3 * delay['sigma'])} ms (1 sigma)"
+        yield f" delay of the wrench: {with_sigma(1e3 * delay['value'], 1e3 * delay['sigma'])} ms (1 sigma)"
     if change := result["bias_change"]:
         pairs = [with_sigma(v, s) for v, s in zip(change["value"], change["sigma"], strict=True)]
         yield f" bias change ± 1 sigma:\n   {', '.join(pairs[:3])} N\n   {', '.join(pairs[3:])} N·m"

@@ -22,7 +22,7 @@ def config() -> None:
 @config.command("show")
 @click.option("--config", "path", type=FILE, help="Show this TOML file instead of ./ftdrive.toml.")
 @click.option("--origin", is_flag=True, help="Print the origin of each value instead of its meaning.")
-@simulate("Show the configuration of an emulated cell. Its addresses end with this command.")
+@simulate("Show the configuration of an emulated cell. Its addresses are valid until this command ends.")
 @EMULATED_SENSOR
 @JSON
 def config_show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as_json: bool) -> None:

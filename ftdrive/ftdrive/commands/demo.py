@@ -121,7 +121,7 @@ def _show_loads(outcome: Outcome, solution: LoadSolution, truth: Mapping[str, An
             "contact_error": {"before": before, "after": after},
         })  # fmt: skip
     else:
-        answer.print(f"A contact of {CONTACT_N:g} N at the tip, error of the force:")
+        answer.print(f"Force error for a contact of {CONTACT_N:g} N at the tip:")
         answer.print(f"  as read by the sensor        {before['as_read_N']:.2f} N")
         for words, found in (("calibrated with the tool", before), ("and with two known loads", after)):
             answer.print(f"  {words:26}  {found['decoded_N']:.2f} N, sigma {found['sigma_N']:.2f} N")

@@ -49,9 +49,9 @@ def history(
     """List results with date and last verification, trends of bias and payload, and the last weighings.
 
     The results come from the store, to which `calibrate` and `verify` add them, or from the run folders in RUNS. A
-    trend is reported if it is significant at 1 % with the uncertainty of the results and with their scatter. If the
-    sensor reports its temperature, the bias is also fitted against the temperature. Runs within a few hours give the
-    change of the bias within an hour.
+    trend is reported if it is significant at 1 %, both with the uncertainty of the results and with their scatter. If
+    the sensor reports its temperature, the bias is also fitted against the temperature. Runs within a few hours give
+    the change of the bias within an hour.
     """
     left_out: tuple[str, ...] = ()
     weighed: Sequence[WeighingDay] = ()
@@ -60,7 +60,7 @@ def history(
         if option := (
             "--index" if index else "--rebuild" if rebuild else "--weighings" if weighings else "--store" if url else ""
         ):
-            raise ConfigError(f"RUNS and {option} exclude one another: leave one out")
+            raise ConfigError(f"RUNS and {option} are mutually exclusive: leave one out")
         records, left_out = read_records(record_paths(folders))
         results = [one for one in records if isinstance(one, StoredResult) and tool in {None, one.tool}]
         results.sort(key=lambda one: (one.created_utc or "", one.id))

@@ -73,7 +73,7 @@ def init(output: Path, simulate: bool, yes: bool, view: ViewOptions, as_json: bo
     from ftdrive.terminal.interview import Interview, say
 
     if yes and view.wanted:
-        raise ConfigError("--yes and --view exclude one another: leave one of them out")
+        raise ConfigError("--yes and --view are mutually exclusive: leave one of them out")
     check_simulate(simulate, real={"--robot": given["robot"]})
     in_force = {key: setting.value for key, setting in settings().items()}
     described = Description(clock_in_force(), in_force, simulate=simulate)
@@ -102,7 +102,7 @@ def init(output: Path, simulate: bool, yes: bool, view: ViewOptions, as_json: bo
             form.run()
         cell = described.cell()
         write_new(output, described.file())
-        words, end = ". Measure tool, planes and boxes, then set measured = true in it: before that, nothing moves.", ""
+        words, end = ". Measure tool, planes and boxes, then set measured = true in it: until then, nothing moves.", ""
         if simulate:
             words, end = " for an emulated cell: commands with --simulate use it, all others refuse it.", " --simulate"
         if page is not None:

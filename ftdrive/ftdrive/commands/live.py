@@ -101,7 +101,7 @@ def live(
     if speed is not None and replay is None:
         raise ConfigError("--speed is only for --replay: add --replay, or leave --speed out")
     if replay is not None and source.tool:
-        raise ConfigError("--tool does not go with --replay: leave one of the two out")
+        raise ConfigError("--tool cannot be combined with --replay: leave one of the two out")
     view.require(once=once, allow_control=allow_control)
     prints = once or as_json or not sys.stdout.isatty() or answer.is_dumb_terminal
     full_screen = not (prints or plain) and has_screen()

@@ -33,7 +33,7 @@ def loads() -> None:
 @SOURCE
 @click.option("--replay", type=PATH, help="Check a recording instead of a cell.")
 @click.option("--zero", is_flag=True, help="Tare the free tool first, which removes the drift since the calibration.")
-@click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Poses to combine.")
+@click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Number of poses to combine.")
 @click.option("--wait", "wait_s", type=Number(1, 600), default=60.0, show_default=True, help="Longest wait, s.")
 @JSON
 def loads_check(
@@ -72,7 +72,7 @@ def loads_check(
     else:
         echo("\n".join(check_lines(found, load)))
     if not isfinite(tare_age_s):
-        drifted = f"Not tared: {100 * found.scale_sigma:.1f} % (1 sigma) includes the drift since the calibration."
+        drifted = f"Not tared: the sigma of {100 * found.scale_sigma:.1f} % includes the drift since the calibration."
         free = "Record the free tool at rest for a second, and then hang the load."
         echo(f"{drifted} {'Use --zero.' if replay is None else free}", err=True)
     if not found.is_within:
@@ -122,7 +122,7 @@ def show(as_json: bool) -> None:
     known = sensor.provenance
     echo(f"{path.name}: sensor {known.get('serial') or 'without serial number'}, {known.get('created_utc')}")
     echo(f"runs: {', '.join(map(str, known.get('runs', ())))}")
-    echo("\n".join(matrix_lines(sensor, 0.2, f"; not linear by {100 * sensor.floor:.2g} % of the load")))
+    echo("\n".join(matrix_lines(sensor, 0.2, f"; nonlinearity {100 * sensor.floor:.2g} % of the load")))
 
 
 @loads.command()

@@ -64,7 +64,7 @@ FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 ALL = click.option(
-    "--all", "every", is_flag=True, help="Also print each finding, the residuals and the contents of sigma."
+    "--all", "every", is_flag=True, help="Also print each finding, the residuals and what each sigma includes."
 )
 JSON_LINES = click.option(
     "--json", "as_json", is_flag=True, help="Print one JSON object per line: events, questions, the result."
@@ -274,7 +274,7 @@ class ViewOptions:
     def require(self, *, once: bool = False, allow_control: bool = False) -> None:
         """Raise `ConfigError` for options that would be ignored, or if a package for the page is missing."""
         if once and self.wanted:
-            raise ConfigError("--view does not go with --once: leave one of the two out")
+            raise ConfigError("--view cannot be combined with --once: leave one of the two out")
         if allow_control and not self.wanted:
             raise ConfigError("--allow-control is only for --view: add --view, or leave --allow-control out")
         if self.wanted:
@@ -358,7 +358,7 @@ def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated:
     """
     if given := [option for option, value in (real if simulate else emulated).items() if value]:
         fix = "leave one of the two out" if simulate else "add --simulate, or leave it out"
-        raise ConfigError(f"{given[0]} {'does not go with' if simulate else 'is only for'} --simulate: {fix}")
+        raise ConfigError(f"{given[0]} {'cannot be combined with' if simulate else 'is only for'} --simulate: {fix}")
 
 
 class SourceOptions(NamedTuple):
@@ -423,7 +423,7 @@ class SourceOptions(NamedTuple):
         own = {"--calibration": self.path, "--tool": self.tool, "--robot": self.described.robot}
         if given := [option for option, value in {**own, **others}.items() if value]:
             raise ConfigError(
-                f"{given[0]} does not go with --raw, which shows a sensor alone: leave one of the two out"
+                f"{given[0]} cannot be combined with --raw, which shows a sensor alone: leave one of the two out"
             )
 
     def open_log(
@@ -464,7 +464,7 @@ def SOURCE(command: Callable[..., None]) -> Callable[..., None]:
         real = {"--tool": source.tool, "--config": described.config, "--robot": described.robot}
         check_simulate(source.simulate, real=real)
         if source.path is not None and source.tool is not None:
-            raise ConfigError("--calibration and --tool exclude one another: leave one of them out")
+            raise ConfigError("--calibration and --tool are mutually exclusive: leave one of them out")
         command(source=source, **options)
 
     force = f"Apply a calibration of another arm, sensor or mount, or one {EDITED}."

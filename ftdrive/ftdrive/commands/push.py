@@ -56,7 +56,7 @@ def push(
 
     The payload is everything below the flange: the calibrated tool, sensor and adapter. The old values are stored in a
     receipt, push.json in the run, for --restore. The arm must be free and at rest, in remote control, without a running
-    program. A program made at the pendant sets the values of its installation again when it starts.
+    program. A program made on the pendant sets the values of its installation again when it starts.
     """
     check_simulate(simulate, real={"--config": described.config, "--robot": described.robot})
     if receipt is not None and (source or payload or gravity):
@@ -103,7 +103,7 @@ def push(
             write_json({"schema_version": 1, **json.loads(saved.read_text(encoding="utf-8")), "file": str(saved)})
             return
     answer.print(f" ✔ Read back: {settings_in_words(read_back)}")
-    answer.print(" Programs made at the pendant set the values of their installation: enter them there too.")
+    answer.print(" Programs made on the pendant set the values of their installation: enter them there too.")
     if saved.exists():  # a temporary run is deleted
         answer.print(f" Receipt {saved}; undo: ftdrive push --restore {shlex.quote(str(saved))}")
 

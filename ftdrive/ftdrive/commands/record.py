@@ -84,8 +84,8 @@ def record(
                 _report_recording(recorder, frame, stream.info.calibration_name, as_json=as_json)
     if recorder.gaps:
         raise RecordingHasGaps(
-            f"gaps: {recorder.gaps}, samples lost: {recorder.lost}. Check cable, supply and load of the "
-            "computer, then record again. The times are in the events of the file"
+            f"gaps: {recorder.gaps}, samples lost: {recorder.lost}. Check the cable, the power supply and the load on "
+            "the computer, then record again. The times are in the events of the file"
         )
 
 

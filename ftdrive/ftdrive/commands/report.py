@@ -96,7 +96,7 @@ def report(
     if source is None and not simulate:
         raise ConfigError("nothing to report: give a calibration.json, a run folder or a table, or --simulate")
     if (form := form or (output.suffix[1:] if output is not None else "html")) not in _FORMATS:
-        raise ConfigError(f"{output} has no suffix of a report: name it .html or .json, or give --format")
+        raise ConfigError(f"{output} does not have the suffix of a report: name it .html or .json, or give --format")
     if form == "html":
         require_extra("report", "a report in HTML (not --format json)", "jinja2", "matplotlib")
     orientation, drift, *known, up = (shared[name] for name in REPORTED[1:7])

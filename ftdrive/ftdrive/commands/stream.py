@@ -27,7 +27,7 @@ from ftdrive.terminal.console import messages, print_address
     help="Address of the server. An address other than loopback is unprotected.",
 )
 @click.option(
-    "--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Port of the server; 0: a free one."
+    "--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Server port; 0 for a free one."
 )
 @click.option("--allow-origin", "origins", metavar="URL", multiple=True, help="Also accept pages from this origin.")
 @click.option("--allow-control", is_flag=True, help="Let pages tare and change frame and stages, as programs can.")

@@ -86,8 +86,8 @@ def verify_command(
     """Compare fresh poses, far from those of the calibration, with its prediction.
 
     The session is like that of `calibrate`: a certified plan, checks, safety questions and guards. Without --max-force
-    and --max-torque, 1 of 100 verifications near the calibrated poses is a false alarm, and more far from them. A
-    failed verification names what has changed, offers the smallest sufficient update, and ends with exit code 7.
+    and --max-torque, 1 of 100 verifications near the calibrated poses is a false alarm; farther away, more are.
+    A failed verification names what has changed, offers the smallest sufficient update, and ends with exit code 7.
     """
     check_simulate(simulate, real={"--config": described.config, "--robot": described.robot})
     mode: Mode = "manual" if manual else "auto"

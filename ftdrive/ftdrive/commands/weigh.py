@@ -34,7 +34,7 @@ from ftdrive.view.page import drawing
 @click.option(
     "--zero", is_flag=True, help="Tare the empty gripper first, which removes the drift since the calibration."
 )
-@click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Poses to combine.")
+@click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Number of poses to combine.")
 @click.option("--moving", is_flag=True, help="Weigh the load while the arm carries it; start with an empty gripper.")
 @click.option("--count", "part_kg", type=POSITIVE, metavar="KG", help="Count parts of this mass.")
 @click.option("--once", is_flag=True, help="Print one weight and exit; with --zero, wait for a part.")
@@ -54,7 +54,7 @@ def weigh_command(
     view: ViewOptions,
     as_json: bool,
 ) -> None:
-    """Weigh the load in the gripper beyond its calibrated tool, in half a second at rest.
+    """Weigh the load in the gripper, without the calibrated tool, in half a second at rest.
 
     One pose gives the mass, and the centre of mass except along gravity, each with one sigma, and the smallest mass
     that differs from zero. Contacts, cables and moving parts are reported and not weighed. With --moving, the load is

@@ -56,8 +56,8 @@ class ExportFormat:
 
 # A target that looks up frames relies on the robot model, so the note contains the required angles.
 _FRAMES: Final = (
-    "The robot model must turn {sensor_frame} against {flange_frame} by roll, pitch, yaw = ({rpy_rad_words}) rad: the "
-    "formats urdf and static-transform write this. {base_frame} must have the axes of {base_axes}."
+    "In the robot model, {sensor_frame} must be rotated from {flange_frame} by roll, pitch, yaw = ({rpy_rad_words}) "
+    "rad: the formats urdf and static-transform write this rotation. {base_frame} must have the axes of {base_axes}."
 )
 # Parameters of ft_estimation_node, ft_tools/src/ft_estimation_node_parameters.yaml.
 _FT_ESTIMATION: Final = {
@@ -89,7 +89,7 @@ _OFFSET: Final = (
     "offset is minus the bias, because the broadcaster adds it.",
     "sensor_filter_chain needs ros2_controllers of September 2025 or newer; Humble has neither it nor offset.",
 )
-_WORLD: Final = "Gravity is in axes of {base_frame}, {base_axes}: turn it if those of the world differ."
+_WORLD: Final = "Gravity is in axes of {base_frame}, {base_axes}: rotate it if the axes of the world differ."
 _OWN_READING: Final[tuple[Property, ...]] = ("tilt", "rotation", "response")
 
 # By name, as in `--format`. Above each row: project, file and version of the reader, and its formula.
@@ -142,7 +142,7 @@ FORMATS: Mapping[str, ExportFormat] = {
             "torque_offset": "$torque_bias_Nm_xyz",
         },
         notes=(
-            "The request of the service ft_estimation_node/set_calibration has it in the field ft_calibration.",
+            "The service ft_estimation_node/set_calibration takes it in the field ft_calibration of its request.",
             _FRAMES,
         ),
         elsewhere=_FT_ESTIMATION,
@@ -210,7 +210,7 @@ FORMATS: Mapping[str, ExportFormat] = {
             "ft_sensor_ref_link must be a link of the robot model between robot_base_link and end_effector_link, with "
             "the origin of the sensor: use the format urdf. The controllers read neither static transforms nor "
             "header.frame_id.",
-            "target_wrench is what the tool shall exert: in axes of end_effector_link, or of robot_base_link if "
+            "target_wrench is the wrench the tool is to exert: in axes of end_effector_link, or of robot_base_link if "
             "hand_frame_control is false.",
             *_OFFSET,
             _FRAMES,
@@ -289,11 +289,11 @@ FORMATS: Mapping[str, ExportFormat] = {
         notes=(
             "{assumed}",
             "The controller zeroes its own force sensor when this runs: keep the tool free and the arm still.",
-            "{inertia_note} Needs PolyScope 5.10; set_payload before that.",
+            "{inertia_note} Needs PolyScope 5.10 or newer; use set_payload before that.",
             "The payload has no bias. How the controller uses it is not public: compare get_tcp_force() without "
             "contact in two poses.",
-            "set_gravity takes the acceleration away from the earth, in base axes. The mounting in PolyScope sets it "
-            "too.",
+            "set_gravity expects the acceleration that points away from the earth, in base axes. The mounting in "
+            "PolyScope sets it too.",
         ),
         elsewhere={"set_gravity": "$minus_gravity_base_m_s2"},
     ),
@@ -334,7 +334,7 @@ iyy="{J[4]!r}" iyz="{J[5]!r}" izz="{J[8]!r}" />
         notes=(
             "{inertia_note}",
             "Leave out the link {flange_frame} if your robot has it.",
-            "The mass of the sensor itself is not in it, nor its bias.",
+            "The model contains neither the mass of the sensor itself nor its bias.",
             _WORLD,
         ),
         elsewhere={"gravity of the simulation": "$gravity_m_s2"},
@@ -383,7 +383,7 @@ iyy="{J[4]!r}" iyz="{J[5]!r}" izz="{J[8]!r}" />
             "Attach the body {tool_frame} to {flange_frame}. A simulated sensor has no bias.",
             "Plain MuJoCo sensors have the opposite sign: negate sensordata, as the hardware interface of "
             "mujoco_ros2_control does, to get the wrench on the sensor.",
-            "{inertia_note} The mass of the sensor itself is not in it.",
+            "{inertia_note} The body does not contain the mass of the sensor itself.",
             "The plugin FtsGravCompPlugin needs a mujoco_ros2_control newer than 0.1.2 (pull request 308, September "
             "2026).",
             _WORLD,

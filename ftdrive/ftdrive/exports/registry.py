@@ -62,7 +62,7 @@ class Settings:
     sensor_mass_kg: float | None = None
     """Mass of sensor and adapter, kg."""
     sensor_com_mm: tuple[float, ...] | None = None
-    """Centre of mass of sensor and adapter from the flange, flange axes, mm; None: half way up on the flange axis."""
+    """Centre of mass of sensor and adapter from the flange, flange axes, mm; None: halfway up on the flange axis."""
     verification: VerificationRecord | None = None
     """Last verification of the calibration; None if there is none."""
 
@@ -153,8 +153,8 @@ class _Values:
         """Position (3,) of the sensor's origin in the flange."""
         if self.settings.height_mm is None:
             raise ConfigError(
-                f"{self.target} needs the height of the sensor's origin above the flange face, which gravity cannot "
-                "show: give --height MM, or set [sensor] height_mm before the next calibration"
+                f"{self.target} needs the height of the sensor's origin above the flange face, which gravity does not "
+                "determine: give --height MM, or set [sensor] height_mm before the next calibration"
             )
         return sensor_origin_m(self.settings.height_mm)
 
@@ -165,7 +165,7 @@ class _Values:
         if self.settings.sensor_mass_kg is None:
             raise ConfigError(
                 f"{self.target} needs the mass of sensor and adapter, because the sensor cannot weigh itself: give "
-                "--sensor-mass KG from scale or datasheet (0 for a sensor inside the arm)"
+                "--sensor-mass KG from a scale or data sheet (0 for a sensor inside the arm)"
             )
         com_mm = self.settings.sensor_com_mm
         sensor_com_m = None if com_mm is None else np.array(com_mm) / 1e3
@@ -227,8 +227,8 @@ def _assumption_note(v: _Values) -> str:
     if not v.settings.sensor_mass_kg or v.settings.sensor_com_mm is not None:
         return ""
     return (
-        f"The centre of mass of sensor and adapter ({v.settings.sensor_mass_kg:g} kg) is taken half way up, on the "
-        "axis of the flange, as `ftdrive push` does: give --sensor-com X,Y,Z if you know it."
+        f"The centre of mass of sensor and adapter ({v.settings.sensor_mass_kg:g} kg) is assumed to be halfway up, on "
+        "the flange axis, as `ftdrive push` does: give --sensor-com X,Y,Z if you know it."
     )
 
 
@@ -391,8 +391,8 @@ def export_calibration(
             if force_N > max_force_error_N:
                 raise NotAccepted(
                     f"{words}, and the limit is {max_force_error_N:g} N. Choose another format "
-                    f"({', '.join(_lossless_formats(calibration, target))}), or accept it: "
-                    f"--max-force-error {_round_up(force_N)}"
+                    f"({', '.join(_lossless_formats(calibration, target))}), or accept the "
+                    f"error: --max-force-error {_round_up(force_N)}"
                 )
             notes.append(f"{words}.")
     notes += filter(None, (note.format_map(values) for note in target.notes))

@@ -76,7 +76,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield f'textmsg("{name}: {len(steps)} poses")'
     yield (
         f'popup("{emulated}Only for a {model} with the tool of {name}. Keep the space '
-        f"{plan.ball_in_words()} (the wrist){'' if plan.arm_rests else ' and the room of the whole arm'} free, "
+        f"{plan.ball_in_words()} (the wrist){'' if plan.arm_rests else ' and the space around the whole arm'} free, "
         f"cables slack, hand on the emergency stop. Speed: {_speeds(plan)}. "
         'First time: speed slider at 30 percent. Continue moves the arm.", '
         f'title="ftdrive", warning=True, blocking=True)'
@@ -114,7 +114,7 @@ def _warnings(model: str, *, is_nominal: bool) -> Iterator[str]:
     yield f"Run it on a {model} with exactly this tool and mounting; in another cell the moves are not proven clear."
     if not is_nominal:
         yield "It is proven with the measured kinematics of one arm: on another one distances are up to 20 mm smaller."
-    yield "The tool turns every way, upside down too: nothing loose, no fluid, nothing in the gripper."
+    yield "The tool turns in all directions, also upside down: nothing loose, no fluid, nothing in the gripper."
     yield (
         f"The approach to the first pose is not in the plan: the program stops unless each joint is within "
         f"{degrees(NEAR_RAD):.0f} degrees of it."
@@ -142,7 +142,7 @@ def _scene(scene: dict[str, Any]) -> Iterator[str]:
     for plane in scene["planes"]:
         normal = ":".join(f"{value:.6g}" for value in plane["normal"])
         place_mm = 1e3 * float(plane["offset_m"])
-        yield f"plane {normal}:{place_mm:.1f}, the arm stays where normal times place is that or more"
+        yield f"plane {normal}:{place_mm:.1f}, the arm stays where normal times position is at least this value"
     for box in scene["boxes"]:
         yield f"box {':'.join(f'{1e3 * float(value):.1f}' for value in (*box['low_m'], *box['high_m']))}"
     if len(scene["planes"]) <= 1 and not scene["boxes"]:

@@ -54,7 +54,7 @@ def _bias_plot(changes: Changes, start: datetime, now: datetime) -> str:
         + '"/>'
         for k in (3, 4, 5, 0, 1, 2)
     )
-    label = f"changes of the six biases in the last {WINDOW.days} days, at most {most:.1f} sigmas"
+    label = f"changes of the six biases in the last {WINDOW.days} days, at most {most:.1f} sigma"
     whole = WIDTH + 40
     return (
         f'<svg viewBox="0 0 {whole} {HEIGHT}" width="{whole}" height="{HEIGHT}" role="img" aria-label="{label}">'

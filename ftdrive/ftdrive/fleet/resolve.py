@@ -221,11 +221,11 @@ class SolvedAgain:
             f"{len(self.failed)} failed."
         )
         yield (
-            f"{self.unchanged} unchanged, {len(self.changed)} changed by more than 3 sigmas, "
+            f"{self.unchanged} unchanged, {len(self.changed)} changed by more than 3 sigma, "
             f"{len(self.other_verdict)} with another verdict."
         )
         for entry in self.changed:
-            how = "was known and differs" if entry["sigmas"] is None else f"changed by {entry['sigmas']:+.1f} sigmas"
+            how = "was known and differs" if entry["sigmas"] is None else f"changed by {entry['sigmas']:+.1f} sigma"
             yield f"changed: {entry['run']}: {entry['parameter']} {how}"
         for entry in self.other_verdict:
             why = f" ({entry['finding']['words']})" if entry["finding"] else ""

@@ -137,7 +137,7 @@ def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[FleetF
         days = (observed.now - due).days
         what = f"The verification of {worst} is {days} d late"
         if len(cells) > 1:
-            what = f"The verifications of {join_names(cells)} are late, the one of {worst} by {days} d"
+            what = f"The verifications of {join_names(cells)} are late, that of {worst} by {days} d"
         yield FleetFinding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
 
 

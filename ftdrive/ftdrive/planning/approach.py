@@ -184,4 +184,4 @@ def _too_near(certifier: Certifier, here: Certificate) -> str:
 
 def _where_to_jog(first: Array) -> str:
     angles = ", ".join(f"{angle:.0f}" for angle in np.degrees(first))
-    return f"jog the arm to within {np.degrees(NEAR_RAD):.0f} degrees of joints {angles}, then start again"
+    return f"jog the arm to within {np.degrees(NEAR_RAD):.0f} degrees of the joint angles {angles}, then start again"

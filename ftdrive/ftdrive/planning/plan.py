@@ -188,8 +188,8 @@ class Plan(Displayed):
         ball = self.ball_in_words()
         if self.arm_rests:
             crossing = "where the axes of wrist 1 and 2 cross"
-            return f"All moving parts stay {ball}, {crossing}: keep that space clear, cables slack."
-        return f"Wrist and tool stay {ball}, and the whole arm moves: keep the space of both clear, cables slack."
+            return f"All moving parts stay {ball}, {crossing}: keep that space clear and cables slack."
+        return f"Wrist and tool stay {ball}, and the whole arm moves: keep the space of both clear and cables slack."
 
     def ball_in_words(self) -> str:
         """Describe radius and centre of the ball."""

@@ -101,7 +101,7 @@ def plan_tour(
         if tour is not None:
             return make_plan(kind, why, certifier, *tour, speeds, guess)
     raise PlanRefused(
-        f"{_reason(poses)}. Nor is a tour at another posture, with the flange in a box, or of other poses proven clear "
+        f"{_reason(poses)}. No tour at another posture, with the flange in a box or with other poses is proven clear "
         "and informative enough to estimate all parameters. Describe the tool more closely, or clear the surroundings"
     )
 
@@ -113,7 +113,7 @@ def _attempts(certifier: Certifier, q_now: Array, poses: int, speeds: Speeds, gu
         q = nodes.constant_tour(q_now, certifier.arm.kinematics)
         fits = _winds_little(q, q_now) and certifier.clear_around(q)
         yield "constant", [why], (nodes.NUMBERS, q) if fits else None
-    why = f"{reason}: the wrist alone visits them in the fastest clear order."
+    why = f"{reason}: the wrist alone visits the orientations in the fastest clear order."
     yield "wrist", [why], _wrist(certifier, q_now, numbers, speeds)
     for tour in filter(certifier.clear_around, with_room(certifier, q_now)):
         elsewhere: Found | None = nodes.NUMBERS, tour
@@ -171,7 +171,7 @@ def _plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess:
     away_mm = 1e3 * np.linalg.norm(certifier.arm.hook_m(certifier.arm.frames(between)) - hook_m, axis=1).max()
     why = [
         f"{HUNG_POSES} tilts with a hanging load. Its hook stays at {_format_point(hook_m)} at each of them, and "
-        f"within {away_mm:.0f} mm of it in the moves, below {1e3 * (speeds.tip_m_s or 0):.0f} mm/s."
+        f"within {away_mm:.0f} mm of it during the moves, below {1e3 * (speeds.tip_m_s or 0):.0f} mm/s."
     ]
     plan = make_plan("hung", why, certifier, numbers, q, speeds, guess)
     # The predicted error is left out, because it ignores the run of the tool alone.
@@ -322,7 +322,7 @@ def _at_pan(q_rad: Array, numbers: Sequence[int]) -> Array:
 
 def _chosen_words(chosen: Chosen) -> list[str]:
     lost = chosen.force_rms_N / chosen.ideal_force_rms_N
-    words = [f"Their predicted error is {lost:.2f} times that of the best poses without limits of reach."]
+    words = [f"Their predicted error is {lost:.2f} times that of the best poses without reach limits."]
     return [*words, _elsewhere_words(chosen.q_rad[0])] if chosen.elsewhere else words
 
 

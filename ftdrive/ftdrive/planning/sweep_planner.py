@@ -245,7 +245,7 @@ def _plan(certifier: Certifier, sweep: Sweep, off_curve_m: float, q_now: Array, 
     why = ["A sweep of the wrist: the most informative curve within the limits that is proven clear."]
     if not np.allclose(q_now, sweep.centre_rad):
         first = np.degrees(sweep.centre_rad).round().astype(int).tolist()
-        why.append(f"Its centre at joints {first} degrees has more room; the plan does not include the approach.")
+        why.append(f"Its centre at joint angles {first} degrees has more room; the plan does not include the approach.")
     why.append(f"Predicted error of force compensation: {force_N:.3f} N.")
     return Plan(
         "sweep",

@@ -254,7 +254,7 @@ def estimated_bias(
     if len(reading) < _LEAST_READINGS:
         seconds = len(reading) * _READING_S + sum(map(len, waiting)) / info.sensor_rate_Hz
         shortest_s = _LEAST_READINGS * _READING_S
-        raise BadDataset(f"{seconds:.1f} s are too short for a bias: record at least {shortest_s:g} s")
+        raise BadDataset(f"{seconds:.1f} s is too short to estimate a bias: record at least {shortest_s:g} s")
     # The bias belongs to readings that no sensor matrix has decoded. The wrench of a free tool is linear in R, so
     # means of R are as good as rotations.
     free_tool = Compensator(calibration.parameters, response=calibration.response)

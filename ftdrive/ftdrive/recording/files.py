@@ -42,7 +42,7 @@ def format_of(path: Path) -> _RecordingFormat:
     """Return the format of a recording. Raises `ConfigError` if it is unknown or its package is missing."""
     ending = Path(path.name.removesuffix(".partial")).suffix
     if ending not in _FORMATS:
-        raise ConfigError(f"{path} has no ending of a recording: name it .mcap, .csv or .parquet")
+        raise ConfigError(f"{path} does not have the suffix of a recording: name it .mcap, .csv or .parquet")
     try:
         import_module(_FORMATS[ending].package)
     except ImportError:

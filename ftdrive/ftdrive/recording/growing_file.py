@@ -98,7 +98,7 @@ def partial_of(path: Path, *, grows: bool) -> Path:
         with open_file(partial) as file:
             if not _lock(file):
                 raise FileExistsError(
-                    f"{_lock_holder(file)} still records to {partial}: choose another name, or end that recording first"
+                    f"{_lock_holder(file)} is still recording to {partial}: choose another name, or end that recording"
                 )
         if not grows:
             raise FileExistsError(

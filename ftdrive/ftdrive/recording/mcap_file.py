@@ -336,7 +336,7 @@ def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
     while len(start := file.read(9)) == 9:
         opcode, length = struct.unpack("<BQ", start)
         if not opcode or length > MOST_BYTES:
-            raise ValueError(f"a record of the kind {opcode} and {length} bytes")
+            raise ValueError(f"a record of kind {opcode} with {length} bytes")
         data = file.read(length)
         if len(data) < length:
             break

@@ -266,7 +266,7 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
         if raw.read() != _PARQUET_END:
             raise BadRecording(
                 "its end is missing, without which Parquet cannot be read. If `convert` or `compensate` was "
-                "interrupted, repeat it. If `record` of an earlier ftdrive was, convert the file with that version"
+                "interrupted, repeat it. If `record` of an older ftdrive was interrupted, convert it with that version"
             )
     try:
         # With a buffer, the columns of a large row group are not read at once.

@@ -93,13 +93,13 @@ def estimates_section(facts: Facts) -> Section:
     text = [
         f"Method {result['method']}, {result['n_poses']} {taken}, gravity {result['g_m_s2']:g} m/s². Wrenches act on "
         "the sensor, in its axes, about its origin. Centre of mass and biases are in sensor axes.",
-        f"Strongest correlations: {pairs}." if pairs else "No two parameters are correlated by more than 0.7.",
+        f"Strongest correlations: {pairs}." if pairs else "No two parameters have a correlation above 0.7.",
     ]
     figure = Figure(
         "correlation",
         f"Matrix of the correlations of the 15 estimated parameters. {text[1]}",
-        "Correlation of the estimates. Good: faint except on the diagonal. A strong field means that the poses "
-        "hardly separate two parameters: add other orientations.",
+        "Correlation of the estimates. Good: faint except on the diagonal. A strong colour elsewhere means that the "
+        "poses hardly separate two parameters: add other orientations.",
     )
     rows = [(name, value, sigma) for _, _, name, _, value, sigma in estimate_rows(result)]
     tables = [ReportTable("", ("quantity", "estimate", "± 1 sigma"), rows)]
@@ -163,7 +163,7 @@ def contact(facts: Facts) -> Section:
     """Return the section with the sigma of a contact, which includes the errors of the sensor."""
     found = facts["contact"]
     text = [
-        "The compensation error above applies to a free tool. Under contact, the errors of the sensor are added, which "
+        "The compensation error above applies to a free tool. Under contact, the errors of the sensor are added; they "
         "increase with the force.",
         f"{found['words']}.",
     ]
@@ -289,9 +289,7 @@ def drift(facts: Facts) -> Section:
     if again is not None:
         text.append(f"{capitalized(again['words'])}.")
     if seen["lag1"] is not None:
-        text.append(
-            f"Residuals of successive poses are correlated by {seen['lag1']:.2f}. Good: near 0. Drift increases it."
-        )
+        text.append(f"Correlation of successive residuals: {seen['lag1']:.2f}. Good: near 0. Drift increases it.")
     tables = tuple[ReportTable, ...]()
     if found is None:
         text.append("The fit found no drift of the bias.")
@@ -430,7 +428,7 @@ def comparison(facts: Facts) -> Section:
     before, now = found["sensors"]
     if before != now:
         text.append(
-            f"Errors of the sensor under contact: {before} before, {now} now. So the same contact has another reading."
+            f"Errors of the sensor under contact: {before} before, {now} now. The same contact now reads differently."
         )
     if found["same_data"]:
         text.append(
@@ -491,9 +489,9 @@ def motion(facts: Facts) -> Section:
     moments, of_moments = (np.array(values) for values in (found["inertia_kg_m2"], sigma["inertia_kg_m2"]))
     principal = np.linalg.eigvalsh(moments)
     text = [
-        f"{100 * found['used_share']:.0f} % of the recording was used. Not used: contacts, gaps, both ends, which the "
-        "filter needs, and fast motion with unknown position.",
-        f"Delay of the wrench after the pose: {with_sigma(1e3 * found['delay_s'], 1e3 * sigma['delay_s'])} ms.",
+        f"{100 * found['used_share']:.0f} % of the recording was used. Not used: contacts, gaps, both ends (needed by "
+        "the filter), and fast motion with unknown position.",
+        f"Delay of the wrench relative to the pose: {with_sigma(1e3 * found['delay_s'], 1e3 * sigma['delay_s'])} ms.",
         f"The origin of the sensor is {with_sigma(1e3 * found['height_m'], 1e3 * sigma['height_m'])} mm above the "
         "flange face, determined from the acceleration.",
         f"Principal moments of inertia about the centre of mass: {', '.join(rounded(1e3 * one) for one in principal)} "

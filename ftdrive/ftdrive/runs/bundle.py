@@ -294,7 +294,7 @@ def unpack(source: Path) -> Iterator[Path]:
 
 def _extract(source: Path, folder: Path) -> Path:
     if (size := source.stat().st_size) > MOST_BYTES:
-        raise BadBundle(f"{source} has {size / 1e9:.0f} GB, a bundle at most {MOST_BYTES / 1e9:g} GB: check the name")
+        raise BadBundle(f"{source} has {size / 1e9:.0f} GB, above the limit of {MOST_BYTES / 1e9:g} GB: check the name")
     try:
         with open_file(source) as file, zipfile.ZipFile(file) as archive:
             _require_harmless(archive.infolist())

@@ -46,8 +46,8 @@ FOREIGN: Final = "OF ANOTHER CELL"
 # Marks that every output shows for some calibrations, with their meaning.
 MARKS: Final[Mapping[str, str]] = {
     EMULATED: "The cell was EMULATED: these are not the values of a real tool.",
-    EDITED: "The file was EDITED BY HAND after it was solved: its verdict and its sigmas are not those of its numbers.",
-    FOREIGN: "The calibration is OF ANOTHER CELL: arm, sensor or mounting differ, and --force applies it all the same.",
+    EDITED: "The file was EDITED BY HAND after it was solved: its verdict and sigmas no longer apply to its numbers.",
+    FOREIGN: "The calibration is OF ANOTHER CELL: arm, sensor or mounting differ, and --force applies it anyway.",
 }
 
 

@@ -48,7 +48,7 @@ class RecordedRun:
         """Advance to the next recorded stop, which must have these joint angles (6,)."""
         self._stop += 1
         if not np.array_equal(q_rad, self._records[self._stop].pose.q_rad):
-            raise ValueError(f"stop {self._stop + 1} of the recording has other joint angles than the routine requests")
+            raise ValueError(f"stop {self._stop + 1} of the recording does not have the joint angles of the routine")
 
     def wait_until_still(self, **_: object) -> None:
         """Start the measurement of a pose."""
@@ -140,7 +140,7 @@ class SolveOptions:
         if as_published and method != "all" and not method.startswith("carlson-"):
             raise ConfigError("--as-published applies only to --method carlson-... and all: leave it out")
         if (earlier is not None or joined) and (method != "ml" or (earlier is not None and joined)):
-            raise ConfigError("--from and --together need --method ml and exclude each other: leave one of them out")
+            raise ConfigError("--from and --together need --method ml and are mutually exclusive: leave one out")
         if joined and pair is not None:
             raise ConfigError("--together joins poses at rest: leave out --wrench and --orientation-file")
         if joined and len(sources) < 2:
@@ -407,7 +407,7 @@ def read_dataset(
     OSError
         The file cannot be read.
     TypeError
-        The source has another type; the message names the right call.
+        The type of the source is not supported; the message names the right call.
 
     Examples
     --------

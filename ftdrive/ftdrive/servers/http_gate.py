@@ -55,7 +55,7 @@ def refusal_reason(headers: Mapping[str, str] | HTTPMessage, bound: str, origins
     """
     host = headers.get("Host", "")
     if not _is_bound(host, bound):
-        return f"the server has another address than {host or 'the empty one in the request'}: use its address"
+        return f"the server has a different address from {host or 'the empty one in the request'}: use its address"
     origin = headers.get("Origin")
     if origin is None or origin in (origins or ()):
         return ""

@@ -92,7 +92,7 @@ class Fixed:
     flange_frame: str = _described_parameter("tool0", "Name of the flange frame, z out: tool0 for a UR, not flange.")
     sensor_frame: str = _described_parameter("ft_sensor", "Name of the sensor frame, used by ~/wrench_raw.")
     publish_base_tf: bool = _described_parameter(
-        False, "Also publish base to flange on /tf, which the arm's driver usually does."
+        False, "Also publish the transform from base to flange on /tf, which the arm's driver usually does."
     )
 
     def __post_init__(self) -> None:

@@ -47,8 +47,8 @@ class TransformPublisher:
         except NoRos2:
             self._static = self._moving = None
             node.get_logger().info(
-                f"tf2_msgs is not installed, so {fixed.flange_frame} to {fixed.sensor_frame} is not published: "
-                "`ftdrive export calibration --format static-transform` writes a command that does"
+                f"tf2_msgs is not installed, so the transform from {fixed.flange_frame} to {fixed.sensor_frame} is not "
+                "published: `ftdrive export calibration --format static-transform` writes a command that publishes it"
             )
             return
         qos = ros2_module("rclpy.qos")

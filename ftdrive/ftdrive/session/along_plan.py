@@ -79,7 +79,7 @@ class _SafetyQuestions:
             *(() if self._load is None else self._load.questions),
             "Is the tool free: no contact, no workpiece, no fluid, cables slack? Is the base bolted?",
             f"Is the space {self._plan.ball_in_words()} (the wrist){room} free of obstacles and people?",
-            "Is the emergency stop in reach, and tested?",
+            "Is the emergency stop within reach, and tested?",
         ):
             self._journal.require(text, assumed=assumed)
         self.ask_reduced(assumed=assumed)
@@ -229,7 +229,7 @@ class AlongPlan:
         with watcher:  # the watcher also sees an emergency stop during a question
             if options.questions and self.todo:
                 if before.certifier.arm.hung is not None:
-                    words = "Is the weight off the tool? You hang it when the arm stands at the first pose."
+                    words = "Is the weight off the tool? You hang it when the arm is at the first pose."
                     cell.journal.require(words, assumed=before.known and not options.real)
                 questions.ask(way, assumed=before.known and not arm_moves(way))  # approaches that move the arm are new
             run = self._session.resumed or self._keep_plan()
@@ -287,7 +287,7 @@ def _range_guard(before: Before) -> guards.RangeGuard:
 
 def _show_plan(before: Before, options: SessionOptions) -> None:
     cell, plan, way = before.cell, before.plan, before.approach.way_rad
-    words = "The arm stands at the first pose."
+    words = "The arm is at the first pose."
     if len(way):
         words = f"Approach to the first pose: {way_in_words(way, before.approach.clearance_m)}."
     cell.journal.show(

@@ -376,7 +376,7 @@ class Drive:
             raise fault(
                 Hazard.OTHER_CLIENT,
                 f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° off the start of the next move: "
-                "stop what else has moved the arm, then resume",
+                "stop whatever else moved the arm, then resume",
             )
 
     def between_looks(self) -> None:

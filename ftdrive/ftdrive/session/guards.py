@@ -199,7 +199,7 @@ class PathGuard(Guard):
             )
         raise fault(
             Hazard.OTHER_CLIENT,
-            f"{words} while the arm should stand still: stop what else moves the arm, then resume",
+            f"{words} while the arm should stand still: stop whatever else moves the arm, then resume",
         )
 
 
@@ -233,7 +233,7 @@ class StallGuard(Guard):
                 DeviceTimeout(
                     f"the arm has not come nearer to its goal for {self._still_s:.0f} s (speed slider "
                     f"{100 * seen.status.speed_slider:.0f} %, scaling {100 * seen.status.speed_scaling:.0f} %): set "
-                    "the slider at the pendant, or find what holds the arm"
+                    "the slider on the pendant, or find what holds the arm"
                 ),
             )
 
@@ -256,7 +256,7 @@ class SliderGuard(Guard):
             raise fault(
                 Hazard.STALL,
                 f"the speed slider was moved from {100 * self._before:.0f} to {100 * seen.status.speed_slider:.0f} %, "
-                "which does not act on a running sweep: start the sweep again at the new speed",
+                "which does not affect a running sweep: start the sweep again at the new speed",
             )
 
 
@@ -376,7 +376,7 @@ class SensorGuard(Guard):
     def look(self, seen: Seen) -> None:
         """Time how long no sample arrives, or all samples are equal."""
         if not np.isfinite(seen.wrench).all():
-            raise fault(Hazard.SENSOR_LOST, f"the sensor sent {seen.wrench.tolist()}: check its cable and supply")
+            raise fault(Hazard.SENSOR_LOST, f"the sensor sent {seen.wrench.tolist()}: check its cable and power")
         if seen.sample == self._sample:
             self._silent_s += seen.dt_s
         else:
@@ -385,7 +385,7 @@ class SensorGuard(Guard):
         if self._silent_s > allowed:
             raise Tripped(
                 Hazard.SENSOR_LOST,
-                DeviceTimeout(f"the sensor has sent no sample for {self._silent_s:.2f} s: check its cable and supply"),
+                DeviceTimeout(f"the sensor has sent no sample for {self._silent_s:.2f} s: check its cable and power"),
             )
         if self._wrench is not None and np.array_equal(seen.wrench, self._wrench):
             self._same_s, self._same = self._same_s + seen.dt_s, self._same + 1
@@ -394,7 +394,7 @@ class SensorGuard(Guard):
         self._wrench = seen.wrench
         if self._silent_s == 0 and self._same > 10 and self._same_s > self.limits.frozen_samples_s:
             raise fault(
-                Hazard.SENSOR_LOST, f"the sensor repeats one reading for {self._same_s:.2f} s: restart it, then resume"
+                Hazard.SENSOR_LOST, f"the sensor repeated one reading for {self._same_s:.2f} s: restart it, then resume"
             )
 
 
@@ -419,7 +419,7 @@ class RangeGuard(Guard):
         share = (np.abs(wrench - self.zero) / self.range).reshape(-1, 6).max(axis=0)
         if share.max() > self.limits.saturation:
             axis = int(share.argmax())
-            verb = "has changed by" if self.zero.any() else "reads"
+            verb = "reading has changed by" if self.zero.any() else "reads"
             raise fault(
                 Hazard.OVERLOAD,
                 f"the sensor {verb} {100 * share[axis]:.0f} % of its range in {AXES[axis]}: "
@@ -474,7 +474,7 @@ class ContactGuard(Guard):
         limit_N = 2 * weight_N + self.limits.unknown_N
         limit_Nm = 2 * weight_N * self.lever_m + self.limits.unknown_Nm
         start = seen.wrench if self._start is None else self._start
-        than = f"since the start, where a tool of {self.heaviest_kg:g} kg is assumed ([tool] mass_kg)"
+        than = f"since the start, more than a tool of {self.heaviest_kg:g} kg ([tool] mass_kg) explains"
         self._trip(seen.wrench - start, limit_N, limit_Nm, "has changed by", than)
 
     def _known(self, seen: Seen, residual: Array) -> None:
@@ -506,8 +506,8 @@ def arm_lost(error: DeviceError, *, moving: bool) -> Tripped:
     if not moving:
         return Tripped(Hazard.CONTROLLER_LOST, error)
     found = (
-        f"{error.found}; a stop was sent, but the arm may not have received it; then it completes the current move, "
-        "which is proven clear, and stops there"
+        f"{error.found}; a stop was sent, but the arm may not have received it; in that case it completes the current "
+        "move, which is proven clear, and stops"
     )
     return Tripped(Hazard.CONTROLLER_LOST, type(error)(found, error.fix))
 
@@ -517,7 +517,7 @@ def by_safety(status: ArmStatus, words: str) -> Tripped:
     mode = status.safety_mode
     if mode == "protective stop":
         payload = "" if status.payload_kg is None else f" (payload set: {status.payload_kg:.2f} kg)"
-        words += f"; usual causes are contact, and a controller with a wrong payload or centre of mass{payload}"
+        words += f"; usual causes are contact and, in the controller, a wrong payload or centre of mass{payload}"
         return fault(Hazard.PROTECTIVE_STOP, words)
     stopped = any(word in mode for word in ("emergency", "safeguard", "enabling"))
     return Tripped(Hazard.EMERGENCY_STOP if stopped else Hazard.SAFETY_MODE, DeviceFault(words))

@@ -175,7 +175,7 @@ class HandGuided:
             for record in earlier:
                 self._learn(record, self._book.judge.add(record))
             if self._ends_by_itself and self._enough:
-                self._note("The poses of the run suffice: the session ends with the next one.")
+                self._note("The poses of the run suffice: the session ends with the next pose.")
             self._show_state(State.MOVE)
             while not self._over:
                 state = self._ask(self._arm.state)
@@ -365,7 +365,7 @@ class HandGuided:
         if self._level is not None:
             for c in np.flatnonzero(restless_channels(wrench, self._level))[:1]:
                 found, unit = wrench[:, c].std(ddof=1), "N" if c < 3 else "N·m"
-                unrest = f"sigma of {CHANNELS[c]} is {found:.2g} {unit}, in the quietest pose {self._level[c]:.2g}"
+                unrest = f"sigma of {CHANNELS[c]} is {found:.2g} {unit}, but {self._level[c]:.2g} in the quietest pose"
         self._note(f"Pose {stop} is not quiet: {unrest}. {advice}", warning=True)
 
     def _obey_keys(self) -> None:
@@ -385,7 +385,7 @@ class HandGuided:
             self._dealt_with = False
             self._note(f"The next pose replaces pose {self._redo}.")
         elif key is Key.SKIP and self._rests_at is not None:
-            self._note("This pose is left out: move the arm on.")
+            self._note("This pose is left out: move the arm to the next one.")
             self._deal_with()
         elif key is Key.PAUSE:
             self._paused = not self._paused
@@ -394,7 +394,7 @@ class HandGuided:
 
     def _greet(self, goal: str) -> None:
         if self._listen:
-            self._note(f"Start the program at the pendant. Each standstill is a pose: {self._hold_still()}.")
+            self._note(f"Start the program on the pendant. Each standstill counts as a pose: {self._hold_still()}.")
         elif self._most_swing_N is not None:
             self._note(
                 "Move the arm slowly, by hand or with the pendant: tilt the tool by 45 to 75° from straight down, to "
@@ -410,9 +410,7 @@ class HandGuided:
 
     def _hold_still(self) -> str:
         seconds = STILL_S + self._sampling.average_s + 3 * LOOK_S
-        return (
-            f"let it dwell {seconds:.1f} s at each pose" if self._listen else f"leave the arm still for {seconds:.1f} s"
-        )
+        return f"let it dwell {seconds:.1f} s at each pose" if self._listen else f"let the arm rest for {seconds:.1f} s"
 
     def _end(self, why: str) -> None:
         self._over = True

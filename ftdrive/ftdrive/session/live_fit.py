@@ -199,7 +199,7 @@ def _hint(R_base_flange: Array, guess: Guess, down_base: Array, most_tilt_rad: f
 
 
 def _simple_motions(last: Array, down_base: Array) -> tuple[list[str], Array]:
-    """Return descriptions of simple motions at the pendant, and the orientations (m, 3, 3) that they lead to."""
+    """Return descriptions of simple motions on the pendant, and the orientations (m, 3, 3) that they lead to."""
     words, candidates = list[str](), list[Array]()
     for axis in "zxy":
         for angle_deg in (90, -90) if axis == "z" else (90, -90, 45, -45):

@@ -92,7 +92,7 @@ class SessionOptions:
             raise ConfigError(f"{self.resume} is {what}, which cannot be resumed: start again with --{begun}")
         if self.mode != "auto" and (begun in _BY_HAND) != self.by_hand:
             way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
-            raise ConfigError(f"{self.resume} was started {way} and can only be resumed so: leave out --{self.mode}")
+            raise ConfigError(f"{self.resume} was started {way}, which cannot be changed: leave out --{self.mode}")
         options = replace(self, mode=begun if self.mode == "auto" else self.mode)
         if options.redo and options.resume is None:
             raise ConfigError("--redo needs a run: name the run with --resume RUN")

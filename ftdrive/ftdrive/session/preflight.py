@@ -122,7 +122,7 @@ def check_total_payload(before: Before) -> Check:
     too_little = status.payload_kg is not None and status.payload_kg < least_kg - described_cell.PAYLOAD_KG
     if check.state == "failed" or too_little:
         total = f"{least_kg:.2f} kg" if tool.mass_kg else f"the mass of sensor, tool and load, above {least_kg:.2f} kg"
-        fix = f"set the payload to {total}, and its centre of mass, at the pendant before the load is hung"
+        fix = f"set the payload to {total}, and its centre of mass, on the pendant before the load is hung"
         return Check(check.name, "failed", f"{check.found}, for {load}", fix)
     return check
 
@@ -173,7 +173,7 @@ def _check_approach(before: Before) -> Check:
     if not approach.certified:
         return Check("approach", "failed", "the approach to the first pose is not proven clear", "jog the arm near it")
     if not len(approach.q_rad):
-        return Check("approach", "ok", "the arm stands at the first pose")
+        return Check("approach", "ok", "the arm is at the first pose")
     nearest_mm = 1e3 * approach.clearance_m
     return Check("approach", "ok", f"moves: {len(approach.q_rad)}, proven clear, clearance {nearest_mm:.0f} mm")
 
@@ -184,7 +184,7 @@ def check_cable(before: Before) -> Check:
     turns = [step.q_rad[5] for step in before.plan.steps]  # an approach stays between these angles
     low, high = min(turns), max(turns)
     now, least, most = np.degrees([stands, low, high])
-    found = f"wrist 3 stands at {now:.0f}° and turns between {least:.0f}° and {most:.0f}°"
+    found = f"wrist 3 is at {now:.0f}° and turns between {least:.0f}° and {most:.0f}°"
     inside = low - _ROUNDED_RAD <= stands <= high + _ROUNDED_RAD
     has_been_there = (before.known or before.resumed) and inside
     if has_been_there or max(high - stands, stands - low) <= WRIST_6_RAD + _ROUNDED_RAD:
@@ -212,8 +212,8 @@ def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
     for q in _points_along(q_rad, step_rad):
         if not arm.within_safety_limits(q.tolist()):
             return (
-                f"the controller's safety limits forbid joints {np.degrees(q).round().astype(int).tolist()} degrees: "
-                "bring joints 1 to 3 to another posture, or check the safety settings"
+                f"the controller's safety limits forbid the joint angles {np.degrees(q).round().astype(int).tolist()} "
+                "degrees: bring joints 1 to 3 to another posture, or check the safety settings"
             )
     return ""
 
@@ -224,7 +224,7 @@ def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
     while (program := arm.status().program) != "stopped":
         if clock.now_s() > deadline_s:
             raise NotAccepted(
-                f"another program is active on the controller ({arm.reported_program() or program}): stop it at the "
+                f"another program is active on the controller ({arm.reported_program() or program}): stop it on the "
                 "pendant, then start again; ftdrive has changed nothing"
             )
         clock.sleep(0.02)

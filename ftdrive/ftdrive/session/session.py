@@ -114,12 +114,12 @@ class Calibrating:
         special = sum(step.number in NUMBERS[24] for step in plan.steps)
         if options.method in SPECIAL and special < 24:
             raise PlanRefused(
-                f"{options.method} needs the 24 special orientations, and the tour has {special} of them: plan all 24, "
-                "jog the arm to a posture with more room, or choose --method lrom"
+                f"{options.method} needs the 24 special orientations, but the tour has {special} of them: plan all "
+                "24, jog the arm to a posture with more room, or choose --method lrom"
             )
         if options.method == "srom" and len(plan.steps) > 24:
             raise PlanRefused(
-                f"srom needs the 24 special orientations alone, and the tour has {len(plan.steps) - 24} other poses: "
+                f"srom needs the 24 special orientations alone, but the tour has {len(plan.steps) - 24} other poses: "
                 "choose --method mixed"
             )
         return plan

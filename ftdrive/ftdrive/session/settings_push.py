@@ -227,12 +227,12 @@ def _gravity_to_set(result: CalibrationResult, lean: Lean, old: ControllerSettin
     # Without a report of the controller's gravity, a change could neither be read back nor be restored.
     if old.up_base_m_s2 is None:
         raise NotAccepted(
-            f"the controller does not report its gravity, so a change could not be read back; the base {lean}, "
-            "compared with [workcell] mounting: set the mounting at the pendant"
+            f"the base {lean} relative to [workcell] mounting, and this controller does not report its gravity vector, "
+            "so a change could not be verified: set the mounting on the pendant"
         )
     if lean.is_other_mounting:
         raise NotAccepted(
-            f"gravity is {lean.deg:.0f}° off the direction in the controller: correct the mounting at the pendant; "
+            f"gravity is {lean.deg:.0f}° off the direction in the controller: correct the mounting on the pendant; "
             "if it is near 180°, check the sensor's sign first"
         )
     if not lean.is_significant:
@@ -349,7 +349,7 @@ def restore(cell: CellConfig, arm: RobotArm, receipt: Receipt) -> Push:
     old, changed = receipt.old, receipt.new
     payload = changed.mass_kg is not None
     if payload and (old.mass_kg is None or old.p_flange_com_m is None):
-        raise NotAccepted(f"{receipt.path} has no old payload, the controller did not report it: set it at the pendant")
+        raise NotAccepted(f"{receipt.path} has no old payload, the controller did not report it: set it on the pendant")
     back = ControllerSettings(
         old.mass_kg if payload else None,
         old.p_flange_com_m if payload else None,

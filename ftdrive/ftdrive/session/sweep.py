@@ -129,7 +129,7 @@ def _rest(drive: Drive, still_timeout_s: float) -> None:
 
 
 def _begin_words(sweep: Sweep) -> str:
-    return f"The arm stands at the start of the sweep, which takes {sweep.duration_s:.0f} s. Begin?"
+    return f"The arm is at the start of the sweep, which takes {sweep.duration_s:.0f} s. Begin?"
 
 
 def _choices(_: int | None, fixed: str) -> tuple[str, dict[str, str]]:

@@ -45,7 +45,7 @@ def take_tour(session: OpenSession) -> Run | None:
         tour = Tour(guarded, driven, quiet_std, book, options)
         tour.run(along.todo)
     missing = "poses are missing" if len(book.run.stops()) <= len(driven.plan.steps) else ""
-    along.judge_completed(f"moves replaced: from {_list_poses(tour.undriven)} on" if tour.undriven else missing)
+    along.judge_completed(f"moves from {_list_poses(tour.undriven)} were replaced" if tour.undriven else missing)
     return book.run
 
 
@@ -73,7 +73,7 @@ class Tour:
         self._nodes, self._now = self._drive.nodes_rad, self._drive.now
         self._quiet_std, self._book, self._options = quiet_std, book, options
         self._certifier = driven.certifier
-        # A load is hung on its string only when the arm stands at the first pose.
+        # A load is hung on its string only when the arm is at the first pose.
         self._to_hang = self._certifier.arm.hung is not None
         self._drive.certifier = self._certifier.without_load
 
@@ -160,7 +160,7 @@ class Tour:
         turn_rad = np.abs(self._nodes[index] - self._arm.state().q_rad)
         moving = [str(joint + 1) for joint in np.flatnonzero(turn_rad > AT_RAD)]
         if not moving:
-            return "the arm stands there, Enter starts the measurement"
+            return "the arm is already there, Enter starts the measurement"
         joints = f"joint{'s' if len(moving) > 1 else ''} {', '.join(moving)}"
         largest = f"largest turn {np.degrees(turn_rad.max()):.0f}°"
         speed_rad_s = self._own_speed(index)
@@ -243,7 +243,7 @@ class Tour:
             return
         if at is None or speed_rad_s is None:
             if self._drive.approach(index, stop) and stop == 1 and not self._to_hang:
-                words = f"The arm stands at the first pose. The tour has {self._now.stops} stops. Begin?"
+                words = f"The arm is at the first pose. The tour has {self._now.stops} stops. Begin?"
                 self._drive.confirm(words)
         else:
             self._drive.show_state(State.MOVE, stop)

@@ -61,7 +61,7 @@ class Verifying:
         """Return calibration, limits and options: the given ones, or those of the resumed run. Raises `ConfigError`."""
         quick, resume = options.fast, options.resume
         if quick and poses is not None:
-            raise ConfigError("--quick and --poses exclude each other: leave one of them out")
+            raise ConfigError("--quick and --poses are mutually exclusive: leave one of them out")
         if resume is None:
             return path, limits, replace(options, poses=poses or (QUICK_POSES if quick else POSES))
         limited = limits != NO_LIMITS

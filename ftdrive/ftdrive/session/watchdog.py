@@ -123,11 +123,11 @@ class Watcher:
         if self._tripped is not None:
             raise self._tripped
         if self._has_ended:
-            raise fault(Hazard.UNGUARDED, "the guard thread has ended, the arm is not watched", "quit this session")
+            raise fault(Hazard.UNGUARDED, "the guard thread has ended, so the arm is not watched", "quit this session")
         if self._motion is not None and (late_s := self.clock.now_s() - self._looked_s) > self._limits.hung_s:
             raise fault(
                 Hazard.UNGUARDED,
-                f"the guards have not looked for {late_s:.1f} s: close other programs on this computer",
+                f"the guards have not checked the arm for {late_s:.1f} s: close other programs on this computer",
             )
 
     def tripped(self, *, wait_s: float) -> Tripped | None:

@@ -188,7 +188,7 @@ class CellSource(SampleSource):
     def station(self) -> Station:
         """The emulated cell; raises `ConfigError` for a real one."""
         if not isinstance(self._given, Station):
-            raise ConfigError("only a stream with simulate=True has a station: this is a real cell")
+            raise ConfigError("only a stream with simulate=True has an emulated cell: this is a real cell")
         return self._given
 
     def _described(self) -> StreamInfo:
@@ -270,7 +270,7 @@ class CellSource(SampleSource):
                 self._was_interrupted = False
                 return Read(rows, begin, self._sensor.temperature_C(), self._pairing.delay_sigma_s)
         role = "arm" if self._pairing.waits_for_pose else "sensor"
-        self._fail(role, DeviceTimeout(f"the {role} sent no new sample for {timeout_s:g} s", "check cable and supply"))
+        self._fail(role, DeviceTimeout(f"the {role} sent no new sample for {timeout_s:g} s", "check cable and power"))
 
     def _next_rows(self, wait_s: float) -> Paired | None:
         waits_for_pose = self._pairing.waits_for_pose
@@ -345,7 +345,7 @@ class CellSource(SampleSource):
         found = FtSamples.concatenate(samples), ArmStates.concatenate(states) if states else None
         for device, rows in zip(("sensor", "arm"), found, strict=True):
             if rows is not None and len(rows) < 2:
-                raise DeviceTimeout(f"the {device} sent {len(rows)} samples in {_RATE_S:g} s", "check cable and supply")
+                raise DeviceTimeout(f"the {device} sent {len(rows)} samples in {_RATE_S:g} s", "check cable and power")
         return found
 
     def _fail(self, role: str, error: DeviceError) -> NoReturn:

@@ -494,7 +494,7 @@ def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Map
     try:
         update = tare(current, R, [rows.raw], drift_N=TARE_DRIFT_N, drift_Nm=TARE_DRIFT_NM)
     except BadDataset:
-        why = f"{found} from the free tool, more than drift explains"
+        why = f"{found} away from the free tool, more than drift explains"
         return None, f"tare refused: {why}; take hand or contact away, or calibrate again", values
     return update, f"tare: the bias has changed by {found}", values
 

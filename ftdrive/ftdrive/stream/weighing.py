@@ -46,7 +46,7 @@ WORDS: Final[Mapping[str, str]] = {
     "samples": "too few samples: wait half a second",
     "moving": "the arm moves: weigh when it has rested for half a second",
     "unsteady": "the reading changes: wait until the part hangs still, and take your hands away",
-    "contact": "a force across gravity, from a contact, a hand or a cable: free the part",
+    "contact": "a horizontal force, from a contact, a hand or a cable: free the part",
     "cable": "a torque that no weight in the gripper exerts, from a cable, hose or contact: let it hang free",
     "changed": "the poses do not agree on one weight: the part slipped, a cable pulls or the load has changed",
     "lifted": "less than the empty tool: contact from below, or the gripper was not empty at the zero; zero again",

@@ -181,7 +181,7 @@ class SignalColumns:
         taken = set[int]()
         for key, column in (given or {}).items():
             if key not in _OWN_KEYS:
-                raise BadDataset(f"--columns {key}={column}: there is no {key}; the names are {', '.join(_OWN_KEYS)}")
+                raise BadDataset(f"--columns {key}={column}: {key} is unknown; the names are {', '.join(_OWN_KEYS)}")
             index, unit = self._find(key, column)
             taken.add(index)
             self._keys[key] = [(index, unit or units[index])]
@@ -219,7 +219,7 @@ class SignalColumns:
         nearest = f" The layout of {program} lacks {', '.join(missing)}." if share else ""
         named = shorten_list([name for name in self.names if name])
         if "wrench" in signals and set(missing) == {"tx", "ty", "tz"}:
-            nearest += " A three-axis sensor has no torques and is not supported."
+            nearest += " A three-axis sensor measures no torque and is not supported."
         return f"no {what} among the columns {named}.{nearest} Name the columns: {self.line(signal)}"
 
     def line(self, signal: str) -> str:

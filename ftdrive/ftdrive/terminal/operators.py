@@ -56,7 +56,7 @@ def not_an_answer(question: Question, typed: str) -> str:
 def read_answer(supervisor: Supervisor, question: Question) -> str:
     """Read one line. Raises the errors of `Supervisor.read_line`."""
     return supervisor.read_line(
-        f"no answer to '{prompt(question).strip()}': run it in a terminal, or send the answer to standard input"
+        f"no answer to '{prompt(question).strip()}': run the command in a terminal, or answer on standard input"
     )
 
 

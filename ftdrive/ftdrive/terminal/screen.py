@@ -130,7 +130,7 @@ def _last_pose(view: SessionView) -> list[Text]:
         return [line, Text("     residual: no previous fit", "dim")]
     off = fit.residual_sigma > OFF_SIGMA
     residual = Text(f"     residual {residual_in_words(fit)}", "bold yellow" if off else "")
-    return [line, residual.append(" OUT OF LINE: press r to redo" if off else "")]
+    return [line, residual.append(" OUTLIER: press r to redo" if off else "")]
 
 
 def _finding_rows(view: SessionView, width: int, *, with_cube: bool) -> list[tuple[int, list[Text]]]:

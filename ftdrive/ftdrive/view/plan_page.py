@@ -89,7 +89,7 @@ class PlanPage:
             return
         self._drawn, t_s, swept = chosen, chosen["along"], chosen["swept"]
         head, *words = describe_move(self._plan, self._tour.move(t_s))
-        rows = [*PLAN_LEGEND, *([(scene.TOOL, "body", "room that the tool sweeps over")] if swept else [])]
+        rows = [*PLAN_LEGEND, *([(scene.TOOL, "body", "space swept by the tool")] if swept else [])]
         shown = controls(
             button("previous", "Previous pose"),
             button("play", "Pause" if chosen["play"] else "Play", tone="good"),
@@ -97,7 +97,7 @@ class PlanPage:
             button("largest", "Largest move"),
             self._tour.slider(t_s),
             choice("speed", "Speed", chosen["speed"], _SPEEDS),
-            check_box("swept", "Room that the tool sweeps over", value=swept),
+            check_box("swept", "Space swept by the tool", value=swept),
         )
         parts = {"scene/legend": scene.legend(*rows), "state": lines(*words, head=head), "controls": shown}
         volumes = self._volumes if swept else dict.fromkeys(self._volumes)

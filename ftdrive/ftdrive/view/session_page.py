@@ -225,7 +225,7 @@ class SessionPage:
     def _forces(self, seen: Seen, load: RangeGuard) -> Parts:
         """Return force and torque with the limits of their guard, and speed and age of the guards' data."""
         if time.monotonic() - self._onlooker.looked_s > _REST_S:
-            rest = "The guards are at rest: the arm is drawn at their last observation."
+            rest = "The guards are inactive: the arm is drawn at their last observation."
             return {"bars": lines(rest, tone=QUIET), "bars/guards": None}
         limits = np.full(6, np.inf) if load.range is None else load.limits.saturation * load.range
         rows = []

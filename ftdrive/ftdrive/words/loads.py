@@ -21,7 +21,7 @@ def check_lines(found: LoadCheck, load: KnownLoad) -> Iterator[str]:
     if load.p_flange_m is not None:
         line = f"; line of action {with_sigma(1e3 * found.off_m, 1e3 * found.off_sigma_m)} mm from {load.name}"
     yield f"{degrees(found.off_vertical_rad):.1f}° off the vertical{line}"
-    promised = f"{100 * found.promised_sigma:.1f} % (1 sigma) that the sensor promises"
+    promised = f"{100 * found.promised_sigma:.1f} % (1 sigma) stated for the sensor"
     if not found.is_within:
         yield f"OUTSIDE the {promised}: check the mass, or calibrate with known loads."
     elif found.is_significant:

@@ -142,7 +142,7 @@ def _plan_in_brief(plan: Plan) -> tuple[str, str]:
     clear = f"{1e3 * nearest.clearance_m:.0f} mm"
     proven = f"proven clear by {clear}" if plan.certified else f"NOT ALL PROVEN CLEAR (nearest: {clear})"
     moving = "only the wrist moves" if plan.arm_rests else "the whole arm moves"
-    room = "" if plan.arm_rests else ", and the room of the whole arm"
+    room = "" if plan.arm_rests else ", and the space around the whole arm"
     motion = f"{count} poses, {count} moves"
     if plan.sweep is not None:
         motion = f"sweep of {plan.sweep.duration_s:.0f} s,"
@@ -288,7 +288,7 @@ def _payload(push: Push, load: FlangeLoad) -> list[str]:
     return [
         f"The centre is in flange axes. One sigma is {sigma}. The inertia {inertia}: gravity does not reveal it.",
         f"The load is {margin_in_words(load.mass_kg, push.devices['arm'].model)}.",
-        "Included are sensor and adapter, {sensor_mass_kg:g} kg; their centre is taken half way up the sensor's "
+        "Included are sensor and adapter, {sensor_mass_kg:g} kg; their centre is assumed to be halfway up the sensor's "
         "height of {sensor_height_mm:g} mm.".format(**push.reason),
     ]
 
@@ -296,7 +296,7 @@ def _payload(push: Push, load: FlangeLoad) -> list[str]:
 def settings_in_words(settings: ControllerSettings | None) -> str:
     """Return the payload and gravity that a controller reports."""
     if settings is None or settings.mass_kg is None:
-        return "the controller does not report its payload: compare it at the pendant"
+        return "the controller does not report its payload: compare it on the pendant"
     up = "" if settings.up_base_m_s2 is None else f", gravity {_format_vector(settings.up_base_m_s2, '.3f')} m/s²"
     return f"{settings.mass_kg:.3f} kg at {_format_vector(settings.p_flange_com_m, '.1f', 1e3)} mm{up}"
 
@@ -304,7 +304,7 @@ def settings_in_words(settings: ControllerSettings | None) -> str:
 def _lean_text(push: Push) -> str:
     up = push.old.up_base_m_s2
     if up is None:
-        return f"The base {push.lean}, compared with [workcell] mounting; the controller does not report its gravity."
+        return f"The base {push.lean}, relative to [workcell] mounting; the controller does not report its gravity."
     off_deg = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
     setting = "level" if off_deg < _LEVEL_DEG else f"{_format_vector(up, '.3f')} m/s²"
     advice = (

@@ -164,7 +164,7 @@ class Operator:
         robot = self._robot
         limits = {name: float(request[name]) for name in SWING_LIMITS if name in request}
         if not robot.arm.at_rest:
-            raise ValueError("the arm moves: let it stand first")
+            raise ValueError("the arm is moving: wait until it has stopped")
         swing = Swing(robot.arm.dh, robot.arm.q, float(request["seconds"]), **limits)
         accepted = robot.start_soon(SwingProgram(robot, swing), by="operator", obstacle=robot.obstacle)
         return {"accepted": accepted, "seconds": swing.duration_s, "period_s": swing.period_s}
@@ -174,7 +174,7 @@ class Operator:
         given = {name: request[name] for name in ("parts_kg", "contacts", "slip_m") if name in request}
         job = Job(request.get("file"), int(request.get("seed", robot.world.seed)), **given)
         if not robot.arm.at_rest:
-            raise ValueError("the arm moves: let it stand first")
+            raise ValueError("the arm is moving: wait until it has stopped")
         accepted = robot.start_soon(Production(robot, job), by="operator", obstacle=robot.obstacle)
         return {"accepted": accepted}
 

@@ -169,7 +169,7 @@ class Robot:
         self.robot_mode = RobotMode.RUNNING
         self.safety_mode = SafetyMode.NORMAL
         self.remote_switches = 0
-        """Number of changes between local and remote control at the pendant."""
+        """Number of changes between local and remote control on the pendant."""
         self.loaded_program: str | None = None  # path of the program
         self.payload_kg = settings.payload_kg
         self.payload_cog_m = settings.payload_cog_m

@@ -133,7 +133,7 @@ def test_wrong_shapes_are_rejected() -> None:
             compensator.sample(bad_wrench, bad_R)
         with pytest.raises(ValueError, match="expected"):
             compensator.batch(bad_wrench, bad_R)
-    with pytest.raises(ValueError, match="use sample for one"):
+    with pytest.raises(ValueError, match="use `sample` for a single wrench"):
         compensator.batch(wrench[0], R[0])
     with pytest.raises(ValueError, match=r"out .*\(3, 6\).*\(4, 6\)"):
         compensator.batch(wrench, R, np.empty((3, 6)))

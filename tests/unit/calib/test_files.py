@@ -25,7 +25,7 @@ def test_a_file_above_the_limit_is_not_read(tmp_path: Path, monkeypatch: pytest.
     path = tmp_path / "dataset.json"
     path.write_text("{}")
     monkeypatch.setattr(files, "MOST_BYTES", 1)
-    with pytest.raises(OSError, match=r"dataset\.json has 0 MB, the limit is"):
+    with pytest.raises(OSError, match=r"dataset\.json has 0 MB, and the limit is"):
         read_file(path)
 
 

@@ -27,7 +27,7 @@ def test_words_come_from_the_table_and_the_values() -> None:
     ("code", "values", "says"),
     [
         ("repeated_poses", {"poses": np.array([3, 7])}, "poses 3, 7 have"),
-        ("cable_pulls", {"poses": ["R03", "R07"]}, "pulls in R03, R07:"),
+        ("cable_pulls", {"poses": ["R03", "R07"]}, "pulls on the tool in R03, R07:"),
         ("constant_force", {"force_N": np.array([1.234, -2, 0])}, "(1.2, -2, 0) N"),
         (
             "com_too_far",

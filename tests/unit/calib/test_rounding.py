@@ -41,4 +41,4 @@ def test_no_finding_rounds_a_sigma_to_zero() -> None:
     assert "the base leans 1.9123° (sigma 0.0041°) towards its -y from" in Finding.of("base_leans", **lean).words
     assert str(Lean(1.9123, 0.00413, "-y")) == "leans 1.9123° (sigma 0.0041°) towards its -y"
     mass = Finding.of("known_mass", "note", known_kg=1.0, mass_kg=1.18652, sigma_kg=0.00108, units=[])
-    assert re.search(r"^1.1865 kg \(sigma 0.0011 kg\) by the data", mass.words)
+    assert re.search(r"^the data give a mass of 1.1865 kg \(sigma 0.0011 kg\)", mass.words)

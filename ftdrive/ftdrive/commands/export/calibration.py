@@ -44,7 +44,7 @@ def _frame_option(option: str, usual: str, words: str) -> Callable[[Any], Any]:
 @click.option(
     "--sensor-com",
     metavar="X,Y,Z",
-    help="Centre of mass of sensor and adapter, mm from the flange face along its axes. [default: half way up]",
+    help="Centre of mass of sensor and adapter, mm from the flange face along its axes. [default: halfway up]",
 )
 @_frame_option(
     "--base-frame",

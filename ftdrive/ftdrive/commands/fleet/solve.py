@@ -41,13 +41,13 @@ def fleet_solve(
 
     The results are compared with the calibrations of the runs. RUNS are run folders or folders of runs; the default is
     all runs in the store. Verifications are left out. Each result is written to its run folder as solved-VERSION.json,
-    which no other command uses. Runs with this file are only compared, so that an interrupted command continues when
+    which no other command uses. Runs with this file are only compared, so an interrupted command continues when
     repeated.
 
     The exit code is 7 if a run could not be solved.
     """
     if folders and url:
-        raise ConfigError("RUNS and --store exclude one another: leave one out")
+        raise ConfigError("RUNS and --store are mutually exclusive: leave one out")
     after = None if since is None else _parse_since(since)
     found = run_folders(folders) if folders else sorted({Path(one.path).parent for one in open_store(url).results()})
     if not found:
@@ -57,7 +57,7 @@ def fleet_solve(
     columns = (TextColumn("Solving"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     progress = Progress(*columns, console=messages, transient=True, disable=not messages.is_terminal)
     if workers and cluster:
-        raise ConfigError("--workers and --cluster exclude one another: leave one out")
+        raise ConfigError("--workers and --cluster are mutually exclusive: leave one out")
     with local_workers(workers) if cluster is None else cluster_workers(cluster) as pool, progress:
         for run, outcome in progress.track(solve_again(runs, pool), total=len(runs)):
             report.add(run, outcome)

@@ -35,15 +35,15 @@ from ftdrive.terminal.text import echo
 def fleet_verify(names: Sequence[str], due: bool, url: str | None) -> None:
     """Verify cells one after the other, with an operator at each.
 
-    At each cell, the command first asks whether an operator is present with the emergency stop in reach. Only yes
+    At each cell, the command first asks whether an operator is present with the emergency stop within reach. Only yes
     starts the session of `ftdrive verify`, with its plan, checks, questions and confirmation. Any other answer skips
     the cell. No option answers this question, and a terminal is required.
     """
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise ConfigError("fleet verify asks at every cell and needs a terminal: run it in one at the cells")
+        raise ConfigError("fleet verify asks at every cell and needs a terminal: run it in a terminal at the cells")
     refuse_variables()
     if names and due:
-        raise ConfigError("CELL and --due exclude one another: leave one of them out")
+        raise ConfigError("CELL and --due are mutually exclusive: leave one of them out")
     url = url or store_url()
     store, now = Store(url), datetime.now(UTC)
     fleet = fleet_state(store, now)
@@ -72,7 +72,7 @@ def fleet_verify(names: Sequence[str], due: bool, url: str | None) -> None:
         for line in lines:
             echo(line)
     if failed:
-        raise NotAccepted(f"the verification failed in {', '.join(failed)}: the lines above have the reasons")
+        raise NotAccepted(f"the verification failed in {', '.join(failed)}: the lines above give the reasons")
     if errors:
         raise click.exceptions.Exit(exit_code(errors[0]) or 1)  # the message of the error is printed already
 
@@ -126,8 +126,8 @@ def _read_cell(one: StoredCell) -> CellConfig:
 
 def _is_attended(one: StoredCell, cell: CellConfig) -> bool:
     text = (
-        f"Cell {one.name}, robot {cell.robot.host}, tool {cell.tool.name}: does an operator stand at this cell, with "
-        "the emergency stop in reach? Only yes starts its verification, Enter skips it"
+        f"Cell {one.name}, robot {cell.robot.host}, tool {cell.tool.name}: is an operator at this cell, with the "
+        "emergency stop within reach? Only yes starts its verification, Enter skips it"
     )
     try:
         return PlainOperator().ask(Question(text, ("yes", "no", ""))) == "yes"

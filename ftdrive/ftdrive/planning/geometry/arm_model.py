@@ -363,7 +363,7 @@ class ArmModel:
             raise ConfigError(f"'{model}' is not a known model of Universal Robots: use one of {', '.join(MODELS)}")
         if name not in SHAPES:
             raise ConfigError(
-                f"the shape of the {name} has not been measured, so that collisions cannot be excluded: use one of "
+                f"the shape of the {name} has not been measured, so collisions cannot be excluded: use one of "
                 f"{', '.join(SHAPES)}"
             )
         if not tool:

@@ -73,5 +73,5 @@ def lean_of(mounting: str | None) -> float:
         return float(np.radians(float(mounting)))
     except ValueError:
         raise ConfigError(
-            f"mounting is '{mounting}': give {', '.join(MOUNTINGS)} or the lean of the base towards -x in degrees"
+            f"mounting is '{mounting}': give {', '.join(MOUNTINGS)} or the tilt of the base towards -x in degrees"
         ) from None

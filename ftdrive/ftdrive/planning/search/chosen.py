@@ -276,7 +276,7 @@ def _tours_at(
     part = connected(certifier, q, group % spins)
     reached = [np.unique(group[part == p]) for p in range(part.max() + 1)]
     here = _begins_here(certifier, q_now, q, part)
-    # The orientations with wrist 2 turned by a full turn form another part, to which no clear approach leads.
+    # Orientations with wrist 2 rotated by 360° form a separate part, which no collision-free approach reaches.
     for p in sorted(range(len(reached)), key=lambda p: (not here[p], -len(reached[p])))[:MOST_PARTS]:
         if len(reached[p]) < poses:
             break

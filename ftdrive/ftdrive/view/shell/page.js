@@ -185,7 +185,7 @@ async function post(name, value) {
     const button = at("stop").querySelector("button");
     if (stops && button) button.firstChild.textContent = "Stop was sent";
   } catch (error) {
-    const sentence = stops ? "Stop was NOT sent, trying again: press q in the terminal, or the emergency stop." : `Not accepted: ${error.message}`;
+    const sentence = stops ? "Stop was NOT sent; trying again. Press q in the terminal, or the emergency stop." : `Not accepted: ${error.message}`;
     if (stops && error.name !== "Error" && !ended) setTimeout(() => post(name, value), 300);  // it did not arrive
     words.hidden = false;
     words.append(made("p", "answer bad", sentence));

@@ -302,7 +302,7 @@ class _Parser:
         left = self._expression(level + 1)
         while operator := self._accept(*operators):
             if operators in _ARITHMETIC and self._is("-", "+"):
-                self._doubt(self._next.place, f"a sign behind {operator!r}")
+                self._doubt(self._next.place, f"a sign after {operator!r}")
             left = Operation(operator, (left, self._expression(level + 1)))
             if operators is _COMPARISONS and self._is(*_COMPARISONS):
                 self._fail("one comparison expected")
@@ -368,7 +368,7 @@ class _Parser:
                 self._expect("=")
                 named[name_given] = self._expression()
             elif named:
-                self._fail("an argument with a name expected behind one with a name")
+                self._fail("a named argument expected after a named one")
             else:
                 args.append(self._expression())
         return Call(place, name, tuple(args), named, runs)

@@ -187,7 +187,7 @@ def tokens_of(text: str) -> Iterator[Token]:
         place = Place(line, at - line_start + 1)
         found = _TOKEN.match(text, at)
         if found is None:
-            raise syntax_error(text, place, f"{text[at : at + 20].splitlines()[0]!r} is no URScript")
+            raise syntax_error(text, place, f"{text[at : at + 20].splitlines()[0]!r} is not URScript")
         kind, at = str(found.lastgroup), found.end()
         word = found[kind]
         if kind == "newline":

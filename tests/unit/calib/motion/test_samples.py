@@ -134,7 +134,7 @@ def test_the_ends_that_both_streams_have_count() -> None:
     assert 0 <= 9.99 + 0.02 - reach_s(WIDE_S) - rows.t_s[-1] < WIDE_S + 3 * MEAN_S
     few = motion_rows((t[:195], values[:195]), (t_pose, poses))
     assert len(few) == 8
-    with pytest.raises(BadDataset, match=r"overlap by 1\.9 s"):
+    with pytest.raises(BadDataset, match=r"overlap by only 1\.9 s"):
         motion_rows((t[:191], values[:191]), (t_pose, poses))
 
 
@@ -175,8 +175,8 @@ def test_samples_that_cannot_be_used_are_refused(wrong: str) -> None:
 @pytest.mark.parametrize(
     ("at", "value", "words"),
     [
-        (0.02, 1e308, "sample 3 at 0.02 s has 1e\\+308, more than any device reports"),
-        (1e6, 1.0, "no sample for 1e\\+06 s before sample 3 at 1e\\+06 s: divide the recording there"),
+        (0.02, 1e308, "sample 3 at 0.02 s has the value 1e\\+308, more than any device reports"),
+        (1e6, 1.0, "no sample for 1e\\+06 s before sample 3 at 1e\\+06 s: split the recording there"),
         (1e300, 1.0, "sample 3 at 1e\\+300 s"),
     ],
 )

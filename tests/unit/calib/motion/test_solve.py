@@ -40,7 +40,7 @@ def test_a_delay_that_explains_little_more_is_none() -> None:
     assert _coarse_delay(rows)[0] == 0.0
     noisy = rows_of(150, TRUTH, sigma=np.repeat([30.0, 3.0], 3))
     assert _coarse_delay(shifted(noisy, 3))[0] == 0.0
-    with pytest.raises(BadDataset, match=r"only 4\.9 s of motion have no gap"):
+    with pytest.raises(BadDataset, match=r"only 4\.9 s of motion are free of gaps"):
         _coarse_delay(rows[:41])
 
 

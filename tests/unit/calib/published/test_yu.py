@@ -138,7 +138,7 @@ def test_srom_names_what_is_missing_repeated_or_off() -> None:
     assert "missing 5; repeated 9." in refusal(np.concatenate([np.delete(R24, 4, axis=0), R24[8:9]]))
     assert "each: repeated 1. Use mixed" in refusal(np.concatenate([R24, R24[:1]]))
     assert "25 not among them" in (extra := refusal(np.concatenate([R24, turned("ZYX", [10, 20, 30])[None]])))
-    assert "Use mixed, which takes further poses" in extra
+    assert "Use mixed, which accepts additional poses" in extra
     bent = R24.copy()
     bent[6] = turned("y", 2.0) @ bent[6]
     assert re.search(r"missing 7; .*row 7 is 2\.00° from orientation 7", refusal(bent))

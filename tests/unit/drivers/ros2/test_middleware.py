@@ -13,7 +13,7 @@ from ftdrivers.ros2.middleware import Node, _stay_on_loopback
 
 def test_without_rclpy_one_sentence_says_both_ways_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rclpy", None)
-    with pytest.raises(NoRos2, match=r"cannot import rclpy .*source a ROS 2 .*on Linux x86-64 `.*ros2"):
+    with pytest.raises(NoRos2, match=r"cannot import rclpy .*source ROS 2 .*on Linux x86-64 `.*ros2"):
         Node("ftdrive")
 
 

@@ -312,10 +312,10 @@ REAL_ARM = [7.4, 1.3]
         (21, 0, None, "21.0 mm and 0.00 degrees .* no known model"),
         (0, 3.1, None, "3.10 degrees .* no known model"),
         (0.9, 0.09, MODELS["UR5e"], None),
-        (1.1, 0, MODELS["UR5e"], "1.1 mm .* controller sends.* contradict"),
-        (0, 0.11, MODELS["UR5e"], "0.11 degrees .* controller sends.* contradict"),
-        (0, 0, drawn("UR5e"), "controller sends.* contradict"),
-        (0, 0, MODELS["UR10e"], "controller sends.* contradict"),
+        (1.1, 0, MODELS["UR5e"], "1.1 mm .* sent by the controller.* disagree"),
+        (0, 0.11, MODELS["UR5e"], "0.11 degrees .* sent by the controller.* disagree"),
+        (0, 0, drawn("UR5e"), "sent by the controller.* disagree"),
+        (0, 0, MODELS["UR10e"], "sent by the controller.* disagree"),
     ],
 )
 def test_a_real_arm_is_read_and_what_contradicts_its_kinematics_is_refused(
@@ -425,7 +425,7 @@ def test_a_follower_finds_silence_as_quickly_as_a_look(
         controller.silent = True
         heard_s = clock.now_s()
         assert len(follow.read(0.05)) == 5
-        with pytest.raises(DeviceTimeout, match=r"stood still at 100\.\d{3} s for 0\.20 s"):  # noqa: PT012
+        with pytest.raises(DeviceTimeout, match=r"stuck at 100\.\d{3} s for 0\.20 s"):  # noqa: PT012
             for _ in range(100):
                 follow.read(0.01)
         assert clock.now_s() - heard_s == pytest.approx(0.2, abs=0.003)

@@ -241,7 +241,7 @@ def test_the_error_of_another_program_is_not_ours(
     script.messages += [Failed(3, 1, "syntax_error_on_line:3:"), Stopped("other")]
     clock.advance(0.1)
     clock.at(0.3, lambda: setattr(controller, "program", 1))
-    with pytest.raises(DeviceFault, match="by itself, or stopped from outside"):
+    with pytest.raises(DeviceFault, match="ended by itself or was stopped from outside"):
         arm.move_to(away(controller), timeout_s=5, guard=no_guard)
 
 

@@ -100,10 +100,10 @@ def test_a_ready_arm() -> None:
         ({"fault": DeviceFault("protective stop", "clear it")}, "robot.safety", "failed", "clear it"),
         ({"safety_mode": "reduced"}, "robot.safety", "warning", "calibrate asks"),
         ({"program": "playing"}, "robot.program", "warning", "refuses to start"),
-        ({"payload_kg": 0.0}, "robot.payload", "failed", "at the pendant"),
-        ({"payload_kg": 0.0, "p_flange_payload_m": None}, "robot.payload", "failed", "at the pendant"),
+        ({"payload_kg": 0.0}, "robot.payload", "failed", "on the pendant"),
+        ({"payload_kg": 0.0, "p_flange_payload_m": None}, "robot.payload", "failed", "on the pendant"),
         ({"p_flange_payload_m": (0.0, 0.0, 0.0)}, "robot.payload", "warning", "centre of gravity"),
-        ({"speed_slider": 0.04}, "robot.speed", "failed", "at the pendant"),
+        ({"speed_slider": 0.04}, "robot.speed", "failed", "on the pendant"),
         ({"payload_kg": None}, "robot.payload", "skipped", ""),
     ],
 )
@@ -367,7 +367,7 @@ def test_calibration_of_another_sensor() -> None:
     assert "cannot check" in unknown.found
     assert "serial=" in str(unknown.fix)
     both = check_calibration(result, {"arm": device("B"), "sensor": device(NOT_REPORTED)})
-    assert (both.state, both.fix) == ("failed", "ftdrive calibrate")
+    assert (both.state, both.fix) == ("failed", "run ftdrive calibrate")
 
 
 @pytest.mark.parametrize(("made", "connected"), [("S", NOT_REPORTED), (NOT_REPORTED, "S"), (NOT_REPORTED,) * 2])
@@ -375,7 +375,7 @@ def test_a_calibration_of_another_model_is_of_another_sensor_without_serial_numb
     devices = {"sensor": {"serial": made, "model": "ATI F/T (NETCANOEM, CAN)"}}
     result = cast(CalibrationResult, SimpleNamespace(provenance={"devices": devices}, verdict="good"))
     check = check_calibration(result, {"sensor": device(connected, "Bota force/torque sensor")})
-    assert (check.state, check.fix) == ("failed", "ftdrive calibrate")
+    assert (check.state, check.fix) == ("failed", "run ftdrive calibrate")
     assert "ATI F/T (NETCANOEM, CAN), but Bota" in check.found
     same = check_calibration(result, {"sensor": device(connected, "ATI F/T (NETCANOEM, CAN)")})
     assert same.state == "warning"
@@ -427,7 +427,7 @@ def test_the_cure_that_a_message_names_is_the_one_shown(error: DeviceError, addr
 
 
 @pytest.mark.parametrize(
-    ("address", "ask"), [(PORT, "ftdrive devices --probe "), (BY_NETWORK, "ping ")], ids=["serial port", "network"]
+    ("address", "ask"), [(PORT, "run ftdrive devices --probe"), (BY_NETWORK, "run ping ")], ids=["serial", "network"]
 )
 def test_to_the_cure_of_a_silence_belongs_how_to_see_who_answers(address: SensorAddress, ask: str) -> None:
     check = of_sensor.check_sensor_error("sensor.stream", DeviceTimeout("silent", "check cable"), address, [ALLOWED])
@@ -440,7 +440,7 @@ def test_to_the_cure_of_a_silence_belongs_how_to_see_who_answers(address: Sensor
     [
         (not_opened("the port does not open"), PORT, FORBIDDEN, "sudo usermod"),
         (not_opened("does not open (13)", "plugged in?"), PORT, FORBIDDEN, "sudo usermod"),
-        (DeviceTimeout("silent for 0.4 s", "check cable and supply"), PORT, FORBIDDEN, "sudo usermod"),
+        (DeviceTimeout("silent for 0.4 s", "check cable and power"), PORT, FORBIDDEN, "sudo usermod"),
         (StreamBroken("the port is gone (x)", "plug it in"), PORT, FORBIDDEN, "sudo usermod"),
         (ConnectError("no port may be read"), PORT, FORBIDDEN, "sudo usermod"),
         (ConnectError("serial number A answers", "check the address"), PORT, FORBIDDEN, "check the address"),
@@ -470,7 +470,7 @@ def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -
     assert (found.found, found.fix) == (error.found, error.fix)
 
 
-@pytest.mark.parametrize(("own", "shown"), [("check the robot", "check the robot"), ("", "ping ur5")])
+@pytest.mark.parametrize(("own", "shown"), [("check the robot", "check the robot"), ("", "run ping ur5")])
 def test_the_error_of_an_arm_that_names_no_cure_gets_one(own: str, shown: str) -> None:
     check = of_arm.check_unreachable(StreamBroken("ur5:30004 was lost (x; y)", own), "ur5")
     assert (check.found, check.fix) == ("ur5:30004 was lost (x; y)", shown)

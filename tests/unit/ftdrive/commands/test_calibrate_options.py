@@ -88,7 +88,7 @@ def test_options_that_exclude_one_another_are_both_named(
     (tmp_path / "plan.json").touch()
     error = call(*options)
     assert isinstance(error, ConfigError)
-    assert str(error).startswith(f"{both} exclude one another")
+    assert str(error).startswith(f"{both} are mutually exclusive")
     assert cells == []
 
 
@@ -104,7 +104,7 @@ def test_unknown_and_repeated_sets_are_refused_before_the_session(sets: str, cel
 def test_a_tour_by_hand_has_not_the_orientations_of_srom(cells: list[Any]) -> None:
     Path("ftdrive.toml").write_text(CELL)
     for method in ("srom", "mixed"):
-        assert f"the 24 orientations that {method} needs" in str(call("--manual", "--method", method))
+        assert f"24 orientations are taken, which {method} needs" in str(call("--manual", "--method", method))
     assert cells == []
     assert isinstance(call("--manual", "--method", "lrom"), Opened)
 

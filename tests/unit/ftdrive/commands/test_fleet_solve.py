@@ -55,7 +55,7 @@ def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(
     assert "1 of 2 runs could not be solved" in err
     assert lines[:2] == [
         f"2 runs with ftdrive {__version__}: 1 solved now, 0 before, 1 failed.",
-        "0 unchanged, 1 changed by more than 3 sigmas, 1 with another verdict.",
+        "0 unchanged, 1 changed by more than 3 sigma, 1 with another verdict.",
     ]
     assert lines[2].startswith(f"changed: {worse}: force_bias_N.z changed by -")
     assert lines[3] == f"verdict: {worse}: usable before, now good"
@@ -89,8 +89,8 @@ def test_runs_without_a_dataset_and_an_empty_store_are_mentioned(run: Callable[.
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["--workers", "2", "--cluster", "dask://host:1"], 2, "--workers and --cluster exclude one another"),
-        ([".", "--store", "sqlite:////x"], 2, "RUNS and --store exclude one another"),
+        (["--workers", "2", "--cluster", "dask://host:1"], 2, "--workers and --cluster are mutually exclusive"),
+        ([".", "--store", "sqlite:////x"], 2, "RUNS and --store are mutually exclusive"),
         (["--since", "soon"], 2, "--since is 'soon': give an age such as 90d or 12h, or a date such as 2026-08-31"),
         (["--since", "999999999d"], 2, "--since is '999999999d': give an age"),
         (["--cluster", "host"], 2, "--cluster is 'host': give the address of a Dask scheduler"),

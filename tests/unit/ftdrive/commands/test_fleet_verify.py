@@ -67,7 +67,7 @@ class Lab:
 
     def ask(self, question: Question) -> str:
         self.asked.append(question.text.split(",")[0].removeprefix("Cell "))
-        assert "emergency stop in reach?" in question.text
+        assert "emergency stop within reach?" in question.text
         assert question.assumed is None
         answer = self.answers.pop(0)
         if isinstance(answer, Exception):
@@ -221,7 +221,7 @@ def test_a_variable_that_would_describe_every_cell_is_refused(
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
-    [(("A", "--due"), "CELL and --due exclude one another"), (("D",), "there is no cell 'D': the cells are A, B, C")],
+    [(("A", "--due"), "CELL and --due are mutually"), (("D",), "there is no cell 'D': the cells are A, B, C")],
 )
 def test_a_wrong_choice_is_refused(arguments: tuple[str, ...], words: str, lab: Lab) -> None:
     code, out, err = lab.run(*arguments)

@@ -257,9 +257,9 @@ def test_a_result_that_solve_saves_in_its_run_is_indexed(
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (["--tool", "gripper", "--calibration", "."], "--calibration and --tool exclude one another"),
-        (["--tool", "gripper", "--simulate"], "--tool does not go with --simulate"),
-        (["--robot", "10.0.0.2", "--simulate"], "--robot does not go with --simulate"),
+        (["--tool", "gripper", "--calibration", "."], "--calibration and --tool are mutually exclusive"),
+        (["--tool", "gripper", "--simulate"], "--tool cannot be combined with --simulate"),
+        (["--robot", "10.0.0.2", "--simulate"], "--robot cannot be combined with --simulate"),
     ],
 )
 def test_options_that_name_another_cell_or_calibration_are_refused(
@@ -280,7 +280,7 @@ def test_a_tool_reaches_the_stream(run: Callable[..., Ran], monkeypatch: pytest.
     for more in ([], ["--force"]):
         run("live", "--tool", "gripper", "--robot", "10.0.0.2", "--sensor", "ati-can://can0", *more)
     assert opened == [("gripper", False), ("gripper", True)]
-    assert "--tool does not go with --replay" in run("live", "--tool", "gripper", "--replay", ".")[2]
+    assert "--tool cannot be combined with --replay" in run("live", "--tool", "gripper", "--replay", ".")[2]
 
 
 def test_the_temperature_is_a_column_if_a_sensor_reports_it(run: Callable[..., Ran], tmp_path: Path) -> None:

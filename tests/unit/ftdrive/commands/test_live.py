@@ -152,7 +152,7 @@ class Interrupted(RecordingSource):
         if 50 < self.reads <= 50 + self.failures:
             self.clock.sleep(3 * timeout_s)
             self.error = "no new sample for 0.300 s"
-            raise DeviceTimeout(self.error, "check cable and supply")
+            raise DeviceTimeout(self.error, "check cable and power")
         return super().read(timeout_s)
 
 

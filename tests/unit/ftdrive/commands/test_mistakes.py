@@ -118,7 +118,7 @@ VALUES = [
     ("live --simulate --about here", 2, "--about"),
     ("live --raw --simulate --view", 2, "leave one of the two out"),
     ("live --speed 2", 2, "--speed is only for --replay"),
-    ("live --raw --simulate --stages bias=false", 2, "--stages does not go with --raw"),
+    ("live --raw --simulate --stages bias=false", 2, "--stages cannot be combined with --raw"),
     ("record -o x.txt --simulate", 2, ".mcap"),
     ("record -o x.csv --simulate --duration ten", 2, "60s"),
     ("convert rec.csv calibration.json", 2, "choose another name"),

@@ -187,7 +187,7 @@ def test_a_full_disk_completes_no_file_and_names_what_is_safe(run_record: Run, m
     [
         (["-o", "a.bag"], "name it .mcap, .csv or .parquet"),
         (["-o", "a.csv", "-o", "a.csv"], "the same file"),
-        (["-o", "a.csv", "--simulate"], "--robot does not go with --simulate"),
+        (["-o", "a.csv", "--simulate"], "--robot cannot be combined with --simulate"),
         (["-o", "a.csv", "--duration", "soon"], "not a duration"),
         (["-o", "c.json"], "never overwritten"),
         (
@@ -407,7 +407,7 @@ def test_parquet_without_its_end_is_made_again(recorded: Path, capsys: pytest.Ca
     [
         ([], "RECORDING"),
         (["--wrench", "c.json"], "c.json is a calibration, which --wrench does not take"),
-        (["a.mcap", "--wrench", "c.json"], "RECORDING does not go with --wrench"),
+        (["a.mcap", "--wrench", "c.json"], "RECORDING cannot be combined with --wrench"),
         (["a.mcap", "--delay", "auto"], "are for recordings of other programs"),
         (["a.mcap", "--about", "here"], "--about is 'here'"),
         (["a.mcap", "--wrench-topic", "/w"], "are only for a ROS bag"),

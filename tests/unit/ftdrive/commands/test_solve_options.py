@@ -24,7 +24,7 @@ PAIR = ("--wrench", "a.csv", "--orientation-file", "b.csv")
         ((*PAIR, "--together"), "poses at rest"),
         (("a.csv", "--from", "old.json", "--method", "srom"), "need --method ml"),
         (("a.csv", "b.csv", "--together", "--method", "lrom"), "need --method ml"),
-        (("a.csv", "b.csv", "--together", "--from", "old.json"), "exclude each other"),
+        (("a.csv", "b.csv", "--together", "--from", "old.json"), "are mutually exclusive"),
         (("a.csv", "b.csv", "-o", "new.json"), "one dataset and one method"),
         (("a.csv", "--method", "all", "-o", "new.json"), "one dataset and one method"),
         (("a.csv", "--table-iii", "-o", "new.json"), "one dataset and one method"),

@@ -31,9 +31,9 @@ def begun(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--quick", "--poses", "3", "--simulate"), "--quick and --poses exclude each other"),
+        (("--quick", "--poses", "3", "--simulate"), "--quick and --poses are mutually exclusive"),
         ((), "no calibration: give --calibration PATH, or --simulate"),
-        (("--simulate", "--robot", "10.0.0.2"), "--robot does not go with --simulate"),
+        (("--simulate", "--robot", "10.0.0.2"), "--robot cannot be combined with --simulate"),
         (("--resume", "RUN", "--quick"), "leave out --quick"),
         (("--resume", "RUN", "--max-force", "1"), "leave out --max-force or --max-torque"),
     ],

@@ -232,7 +232,7 @@ def test_the_note_turns_the_sensor_of_the_robot_model(base_frame: str, flange_fr
     rng = np.random.default_rng(2)
     calibration = arbitrary(rng, ("rotation",))
     (note,) = export_calibration(calibration, "kth", settings_of(rng, base_frame, flange_frame)).notes[-3:-2]
-    rpy = re.search(rf"turn ft_sensor against {flange_frame} by roll, pitch, yaw = \(([^)]*)\) rad", note)
+    rpy = re.search(rf"ft_sensor must be rotated from {flange_frame} by roll, pitch, yaw = \(([^)]*)\) rad", note)
     assert rpy
     R_frame_sensor = Rotation.from_euler("xyz", [float(x) for x in rpy[1].split(",")]).as_matrix()
     assert np.allclose(tool0_from(flange_frame) @ R_frame_sensor, calibration.R_flange_sensor, atol=1e-5)

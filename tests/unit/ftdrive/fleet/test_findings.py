@@ -130,7 +130,7 @@ def test_late_verifications_are_one_finding() -> None:
     names = [cell(name) for name in "abcde"]  # e was never calibrated; c is due since half a day
     (one,) = fleet(names, results, [check(results[1], 19)]).findings
     assert (one.kind, one.cells) == ("overdue", ("a", "b"))
-    assert one.words == "The verifications of a and b are late, the one of a by 23 d: run `ftdrive fleet verify --due`"
+    assert one.words == "The verifications of a and b are late, that of a by 23 d: run `ftdrive fleet verify --due`"
     (alone,) = fleet([cell("a")], results).findings
     assert alone.words.startswith("The verification of a is 23 d late")
 

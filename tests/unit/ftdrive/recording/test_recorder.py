@@ -240,7 +240,7 @@ def test_a_file_that_still_grows_is_not_to_be_deleted(tmp_path: Path) -> None:
     path = tmp_path / "peg.csv"
     recorder = Recorder([path], info(), {})
     recorder.add(block(500), [])
-    with pytest.raises(FileExistsError, match=f"process {os.getpid()} still records to .*: choose another name"):
+    with pytest.raises(FileExistsError, match=f"process {os.getpid()} is still recording to .*: choose another name"):
         require_new_recordings([path])
     recorder.end()
     path.rename(tmp_path / "peg.csv.partial")  # as a process leaves it that ends at once

@@ -382,7 +382,7 @@ def test_a_result_without_its_data_is_reported_as_far_as_it_goes(tmp_path: Path)
 def test_a_file_of_another_format_is_refused_before_any_work(name: str) -> None:
     error = command("--simulate", "-o", name).exception
     assert isinstance(error, ConfigError)
-    assert str(error) == f"{name} has no suffix of a report: name it .html or .json, or give --format"
+    assert str(error) == f"{name} does not have the suffix of a report: name it .html or .json, or give --format"
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:

@@ -209,7 +209,7 @@ def test_a_hostile_or_damaged_bundle_is_refused(
 def test_a_file_larger_than_any_bundle_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = zipped(tmp_path / "a.zip", {"bundle.json": ABOUT, "r/run.json": "{}"})
     monkeypatch.setattr(bundle, "MOST_BYTES", 100)
-    with pytest.raises(BadBundle, match="a bundle at most 1e-07 GB: check the name"), unpack(path):
+    with pytest.raises(BadBundle, match="above the limit of 1e-07 GB: check the name"), unpack(path):
         pass
 
 

@@ -103,7 +103,7 @@ def test_the_host_is_the_bound_address(host: str, bound: str, served: bool) -> N
     "host", ["127.0.0.1:10019.evil", "127.0.0.1:x", "evil@127.0.0.1", "127.0.0.1/evil", "[::1]evil"]
 )
 def test_what_only_begins_as_the_address_is_refused(host: str) -> None:
-    assert "the server has another address than" in refusal_reason({"Host": host}, "127.0.0.1")
+    assert "the server has a different address from" in refusal_reason({"Host": host}, "127.0.0.1")
 
 
 def test_only_the_stream_has_an_option_for_other_pages() -> None:

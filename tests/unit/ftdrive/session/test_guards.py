@@ -192,7 +192,7 @@ def test_a_sensor_that_repeats_itself_and_one_that_says_nothing_are_seen() -> No
     looks = Looks(SensorGuard(LIMITS))
     before_s = looks.t_s
     trip = looks.trip(100, wrench=WEIGHT)
-    assert (trip.hazard, "repeats" in str(trip)) == (15, True)
+    assert (trip.hazard, "repeated" in str(trip)) == (15, True)
     assert 0.2 < looks.t_s - before_s < 0.225
     assert Looks(SensorGuard(LIMITS)).trip(wrench=np.full(6, np.nan)).hazard == 15
 

@@ -15,7 +15,7 @@ from tests.unit.ftdrive.session.scenarios import (
     status,
 )
 
-QUESTIONS = ("Is the tool free", "Is the space within", "Is the emergency stop in reach")
+QUESTIONS = ("Is the tool free", "Is the space within", "Is the emergency stop within reach")
 PAUSE = {"move 4": press(Key.PAUSE)}
 PAUSED = (4, "paused by the operator")
 UNCONFIRMED = (4, "not confirmed: Approach")
@@ -66,7 +66,7 @@ A_PERSON_SAYS_NO = {
         holds=((4, "unexpected contact"), (4, "not confirmed: Approach back")),
     ),
     "a tour that may not begin yet is held at its first pose": Case(
-        {}, ("resume",), {"Begin?": ("no",)}, holds=((1, "not confirmed: The arm stands"),)
+        {}, ("resume",), {"Begin?": ("no",)}, holds=((1, "not confirmed: The arm is at"),)
     ),
     **{
         f"a no to {words!r} before the first motion ends the session": Case(

@@ -88,7 +88,7 @@ def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path
     lab.arm.q[5] = np.radians(-90)
     made_there = tmp_path / "there.json"
     assert lab.take_poses(dry_run=True, output=made_there) is None
-    assert "wrist 3 stands at -90°" in next(e.words for e in lab.operator.of(Checked) if e.name == "cable")
+    assert "wrist 3 is at -90°" in next(e.words for e in lab.operator.of(Checked) if e.name == "cable")
     lab.arm.q[5] = np.radians(160)
     lab.operator.shown.clear()
     refuse_plan = pytest.raises(NotAccepted, match=r"160°.* -?\d+° and -?\d+°")
@@ -101,7 +101,7 @@ def test_a_plan_that_has_run_before_does_not_excuse_a_wound_cable(lab: Lab) -> N
     lab.take_poses()
     lab.arm.q[5] -= 2 * np.pi
     lab.operator.shown.clear()
-    with pytest.raises(NotAccepted, match="wrist 3 stands at"):
+    with pytest.raises(NotAccepted, match="wrist 3 is at"):
         lab.take_poses(plan=lab.run().folder / "plan.json")
 
 
@@ -156,7 +156,7 @@ def test_a_speed_slider_that_doctor_calls_too_low_is_refused(lab: Lab) -> None:
     assert lab.take_poses(dry_run=True) is None
     lab.arm.set_status(speed_slider=SLOWEST_SLIDER - 0.01)
     assert check_speed(lab.arm.status()).state == "failed"
-    refuse(lab, "slider: speed slider at 4 %.*raise the speed slider at the pendant")
+    refuse(lab, "slider: speed slider at 4 %.*raise the speed slider on the pendant")
 
 
 def test_another_arm_than_the_one_that_is_meant_is_refused(lab: Lab) -> None:
@@ -205,7 +205,7 @@ def test_a_program_of_another_client_is_refused_before_anything_is_done(
 ) -> None:
     monkeypatch.setattr(lab.arm, "reported_program", lambda: "PLAYING pick.urp")
     lab.arm.program = program
-    words = r"program is active on the controller \(PLAYING pick\.urp\): stop it at the pendant, then start again"
+    words = r"program is active on the controller \(PLAYING pick\.urp\): stop it on the pendant, then start again"
     with pytest.raises(NotAccepted, match=words):
         lab.take_poses(dry_run=dry_run)
     assert (lab.arm.opened, lab.arm.moves, lab.operator.asked) == (1, [], [])

@@ -310,7 +310,7 @@ def test_a_run_by_hand_goes_on_by_hand(mode: str, lab: Lab) -> None:
         assert len(lab.operator.of(RunOpened)) == 1
     assert not lab.arm.control
     assert (run.folder / "run.json").exists()
-    with pytest.raises(ConfigError, match=f"with --{mode} .* leave out --step"):
+    with pytest.raises(ConfigError, match=f"with --{mode}, .* leave out --step"):
         lab.take_poses(resume=run.folder, mode="step")
     with pytest.raises(ConfigError, match="leave out --redo"):
         lab.take_poses(resume=run.folder, redo=(1,))

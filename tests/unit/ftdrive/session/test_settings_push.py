@@ -196,7 +196,7 @@ def test_a_calibration_of_other_devices_is_refused(cell: Cell, devices: Any, say
 
 def test_a_rejected_calibration_is_refused(cell: Cell) -> None:
     rejected = Finding.of("second_solution", probability_percent=40.0)
-    with pytest.raises(NotAccepted, match=r"rejected \(40 % probability of a very different mounting"):
+    with pytest.raises(NotAccepted, match=r"rejected \(a very different mounting \(probability 40 %\) explains"):
         cell.propose(cell.result(findings=(rejected,)))
 
 
@@ -343,7 +343,7 @@ def test_a_base_that_agrees_with_the_controller_needs_no_gravity(cell: Cell) -> 
 
 def test_gravity_that_is_not_reported_is_not_set(cell: Cell) -> None:
     cell.arm.settings = replace(OLD, up_base_m_s2=None)
-    with pytest.raises(NotAccepted, match=r"leans 1.80000° .* set the mounting at the pendant"):
+    with pytest.raises(NotAccepted, match=r"leans 1.80000° .* set the mounting on the pendant"):
         cell.propose(cell.result(lean_deg=1.8), payload=False, gravity=True)
     push = cell.propose(cell.result(lean_deg=1.8))
     assert any("does not report its gravity" in line for line in proposal_in_lines(push))

@@ -179,7 +179,7 @@ STOPS = {
     "a question that is not answered with yes leads back to the hold": Case(
         {"move 4": status("robot emergency stop"), "hold": status()},
         ("resume", "resume"),
-        {"Is the emergency stop in reach": ("yes", "no", "yes")},
+        {"Is the emergency stop within reach": ("yes", "no", "yes")},
         rows=(11,),
         holds=((4, "robot emergency stop"),),
         noted={"not yet": 1, "not yet: not confirmed": 1},
@@ -420,7 +420,7 @@ def test_saturation_that_the_guards_or_only_the_samples_of_a_pose_show_discards_
     assert lab.stops() == [1, 2, 3]
 
 
-QUESTIONS = ("Is the tool free", "Is the space within", "Is the emergency stop in reach")
+QUESTIONS = ("Is the tool free", "Is the space within", "Is the emergency stop within reach")
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def test_the_states_follow_one_another_and_all_is_written_down(lab: Lab) -> None
 def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> None:
     lab.take_poses()
     texts = [question.text for question in lab.operator.asked]
-    order = ["tool free", "within 0.3", "emergency stop in reach", "Type MOVE", "Begin"]
+    order = ["tool free", "within 0.3", "emergency stop within reach", "Type MOVE", "Begin"]
     assert [next(word for word in order if word in text) for text in texts] == order
     assert all(question.assumed is None for question in lab.operator.asked)
     assert len(lab.operator.of(Asked)) == 5
@@ -152,7 +152,7 @@ RUNS = {
             {"move 4": press(Key.PAUSE)},
             ("back", "resume"),
             holds=((4, "paused"), (5, "back at pose 3")),
-            noted={"moves replaced: from pose": 1},
+            noted={"moves from pose": 1},
         ),
         False,
     ),
@@ -179,7 +179,7 @@ def test_a_skipped_pose_counts_against_the_plan_though_resume_takes_it(lab: Lab)
     lab.operator.answers["Pose 3 of 7"] = ["s"]
     lab.take_poses(mode="step")
     assert "slow again" in lab.said()
-    assert "from poses 2 and 3 on" in lab.said()
+    assert "moves from poses 2 and 3 were replaced" in lab.said()
     lab.operator.shown.clear()
     lab.take_poses(resume=lab.run().folder, mode="auto")
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]

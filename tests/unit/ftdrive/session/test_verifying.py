@@ -116,7 +116,7 @@ def test_an_unchanged_cell_passes_at_poses_that_were_not_used(
 def test_the_session_is_that_of_a_calibration(lab: Lab, take: Callable[..., Run]) -> None:
     run = take()
     texts = [question.text for question in lab.operator.asked]
-    order = ["tool free", "within 0.3", "emergency stop in reach", "Type MOVE", "Begin"]
+    order = ["tool free", "within 0.3", "emergency stop within reach", "Type MOVE", "Begin"]
     assert [next(word for word in order if word in text) for text in texts] == order
     assert {event.name for event in lab.operator.of(Checked)} >= {"plan", "approach", "safety", "limits"}
     assert lab.operator.states()[-1] is State.REPORT

@@ -378,7 +378,7 @@ def test_a_tare_takes_drift_of_the_bias_away_in_every_orientation() -> None:
 @pytest.mark.parametrize(
     ("push", "why"),
     [
-        (np.array([0, 0, 3.4, 0, 0, 0]), r"3\.\d+ N .* sigma\) from the free tool"),
+        (np.array([0, 0, 3.4, 0, 0, 0]), r"3\.\d+ N .* sigma\) away from the free tool"),
         (np.array([0.8, 0, 0, 0, 0.15, 0]), "take hand or contact away"),
         (np.outer(np.linspace(0, 1, 1000), [0, 0, 2.0, 0, 0, 0]), "the reading changes"),
     ],

@@ -51,7 +51,7 @@ class Link:
     def open(self, **_: Any) -> None:
         self.opened += 1
         if self.silent:
-            raise DeviceTimeout("no sample for 1 s", "check cable and supply")
+            raise DeviceTimeout("no sample for 1 s", "check cable and power")
         self.failure = None
 
     def close(self) -> None: ...
@@ -90,7 +90,7 @@ class Link:
         if self.silent and timeout_s:
             self.clock.advance(0.3)
         if self.silent:
-            self.failure = DeviceTimeout("no sample for 0.3 s", "check cable and supply")
+            self.failure = DeviceTimeout("no sample for 0.3 s", "check cable and power")
             raise self.failure
         numbers = np.arange(self.sent, max(self.sent, self._due()))
         self.sent += len(numbers)

@@ -233,7 +233,7 @@ BROKEN: dict[str, tuple[str | bytes, str, TableOptions]] = {
     "a number beyond the last": (text(PLAIN), r"--columns fx=99: the columns are", named(fx="99")),
     "an unknown name of ours": (
         text(PLAIN),
-        r"--columns force=fx: there is no force; the names are t, fx, fy",
+        r"--columns force=fx: force is unknown; the names are t, fx, fy",
         named(force="fx"),
     ),
     "a wrong unit": (text(PLAIN), r"column 'fx' has the unit pc", named(fx="fx [pc]")),

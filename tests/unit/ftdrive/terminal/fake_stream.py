@@ -163,7 +163,7 @@ class FakeStream(_AnyStream):  # type: ignore[misc]  # of no class of the produc
 
     def read(self) -> Block:
         if self._is_silent:
-            raise DeviceTimeout("ATI Mini45 FT12345 sent no sample for 0.31 s", "check its cable and supply")
+            raise DeviceTimeout("ATI Mini45 FT12345 sent no sample for 0.31 s", "check its cable and power supply")
         n = self._per_block
         t_ns = self.now_ns + (np.arange(n) + 1) * (self._block_ns // n)
         contact = self._contact(t_ns)

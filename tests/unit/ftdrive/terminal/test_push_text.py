@@ -68,4 +68,4 @@ def test_what_a_controller_reports_is_one_line() -> None:
     assert settings_in_words(OLD) == "0.600 kg at (0.0, 0.0, 30.0) mm, gravity (0.000, 0.000, 9.820) m/s²"
     assert settings_in_words(replace(OLD, up_base_m_s2=None)) == "0.600 kg at (0.0, 0.0, 30.0) mm"
     for nothing in (None, ControllerSettings()):
-        assert settings_in_words(nothing) == "the controller does not report its payload: compare it at the pendant"
+        assert settings_in_words(nothing) == "the controller does not report its payload: compare it on the pendant"

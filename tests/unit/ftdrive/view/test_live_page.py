@@ -347,7 +347,7 @@ def test_a_failed_drawing_is_said_once_and_ends_nothing_else(monkeypatch: pytest
 def test_options_that_would_be_ignored_are_refused() -> None:
     with pytest.raises(ConfigError, match="--allow-control is only for --view"):
         ViewOptions(False, None).require(once=False, allow_control=True)
-    with pytest.raises(ConfigError, match="--view does not go with --once"):
+    with pytest.raises(ConfigError, match="--view cannot be combined with --once"):
         ViewOptions(False, "0.0.0.0:8080").require(once=True, allow_control=False)
     ViewOptions(False, None).require(once=True, allow_control=False)
 

@@ -175,7 +175,7 @@ def test_the_room_that_the_tool_sweeps_over(shown: Shown, page: Page) -> None:
     assert len(copies) > 50
     np.testing.assert_allclose(np.linalg.norm(copies[:, 3:], axis=1), 1, atol=1e-3)
     assert np.ptp(copies[:, :3], axis=0).max() > 0.1
-    assert [words for _, _, words in parts["scene/legend"]["rows"]][-1] == "room that the tool sweeps over"
+    assert [words for _, _, words in parts["scene/legend"]["rows"]][-1] == "space swept by the tool"
     page.act("viewer 0", "swept", False)
     assert not [name for name in parts_of(shown) if name.startswith("scene/swept")]
 

@@ -296,7 +296,7 @@ def test_force_and_torque_are_shown_with_the_limits_of_their_guard(
     assert panels(watched.shown()) == snapshot
     onlooker.looked_s -= 1
     parts = watched.shown()
-    assert "The guards are at rest" in texts(parts["bars"])
+    assert "The guards are inactive" in texts(parts["bars"])
     assert "bars/guards" not in parts
 
 
