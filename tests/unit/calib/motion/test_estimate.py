@@ -214,31 +214,6 @@ def test_a_smooth_error_of_the_poses_is_part_of_sigma() -> None:
     assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.4
 
 
-def test_sums_of_many_rows_are_those_of_their_parts(posed: Posed) -> None:
-    """More rows than are summed at once, noise that is correlated, and rows that are left out."""
-    _, load, _ = posed
-    rows = rows_of(1010, load, seed=4)
-    wide = Problem(rows, None, G, point_mass=False)
-    effects = np.zeros(len(wide.basis))
-    kept = all_kept(rows)
-    kept[990:995] = False
-    filters = np.zeros((2, 6, 2))
-    filters[0, :, 0], filters[1] = 1.0, [1.25, -0.75]
-    noise = RowNoise(SIGMA[None] * np.array([[1.0], [3.0]]), filters, np.eye(6))
-    state = np.arange(1010, dtype=np.intp) % 2
-    H, b, chi2 = wide.sums(load, effects, noise, kept, state)
-    unit = (rows.wrench - wide.predict(load, rows)) / noise.scale[state]
-    J = motion_jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / noise.scale[state][:, :, None]
-    white, derivative = unit.copy(), J.copy()
-    for k in np.flatnonzero(kept):
-        if k > 0 and kept[k - 1]:
-            white[k], derivative[k] = 1.25 * unit[k] - 0.75 * unit[k - 1], 1.25 * J[k] - 0.75 * J[k - 1]
-    white, derivative = white[kept].ravel(), derivative[kept].reshape(-1, SIZE)
-    assert chi2 == pytest.approx(float(white @ white))
-    np.testing.assert_allclose(H[:SIZE, :SIZE], derivative.T @ derivative, rtol=1e-9, atol=1e-6)
-    np.testing.assert_allclose(b[:SIZE], derivative.T @ white, rtol=1e-9, atol=1e-6)
-
-
 def test_contact_is_first_judged_by_the_quiet_rows_of_each_state() -> None:
     truth = load_of(Truth())
     rows = rows_of(400, truth, seed=2, sigma=np.zeros(6))
