@@ -50,14 +50,6 @@ def solved(R: Array, wrench: Array, known: Known | None = None, payload_kg: floa
     return solve(dataset, known=known, setup=Setup(payload_kg=payload_kg))
 
 
-def test_the_order_of_quaternions_is_named() -> None:
-    _, R, wrench = session(1)
-    quaternions = Rotation.from_matrix(R).as_quat()
-    finding = first(Rotation.from_quat(np.roll(quaternions, 1, axis=1)).as_matrix(), wrench)
-    assert (finding.code, finding.values["order"]) == ("quaternion_order", "w, x, y, z")
-    assert finding.values["corrected_N"] < 0.4 * finding.values["residual_N"]
-
-
 def angles_in(R: Array, order: Any) -> Array:
     """Angles about x, y and z as a program writes them that turns in this order."""
     return np.asarray(Rotation.from_matrix(R).as_euler(order)[:, [order.index(axis) for axis in "xyz"]])

@@ -291,17 +291,6 @@ def test_a_smooth_error_limits_from_a_fifth_of_a_percent_of_the_weight_on(
     assert [(one.code, one.severity) for one in named if one.code in SMOOTH] == found
 
 
-def test_the_next_use_has_the_noise_that_explains_the_residuals_or_else_those_of_left_out_poses() -> None:
-    wrench = noisy(np.random.default_rng(32), R24)
-    measured, unknown = fit(R24, wrench, white(24)), fit(R24, wrench)
-    expected = measured.predicted_error()
-    quality, other = judge(measured), judge(unknown)
-    names = "next_use_force_rms_N", "next_use_torque_rms_Nm"
-    assert [quality.uses[name] for name in names] == pytest.approx([*expected])
-    left_out = other.loo_force_rms_N, other.loo_torque_rms_Nm
-    assert [other.uses[name] for name in names] == pytest.approx([*left_out])
-
-
 # Real sessions
 
 

@@ -95,16 +95,6 @@ def test_sums_give_the_same_as_the_data(with_bias: bool) -> None:
 # The minima
 
 
-@slow
-@given(seeds, st.floats(1e-6, 1e6), st.floats(1e-3, 1e3))
-def test_minima_scale_with_units(seed: int, weight: float, unit: float) -> None:
-    R_base_flange, force, _ = problem(seed, 8, noise_N=5)
-    found = rotation_minima.minima(rotation_minima.force_cost(R_base_flange, force, np.ones(8)))
-    scaled = rotation_minima.minima(rotation_minima.force_cost(R_base_flange, unit * force, np.full(8, weight)))
-    assert [m.cost for m in scaled] == pytest.approx([weight * unit**2 * m.cost for m in found], rel=1e-9)
-    assert max(nearest(found, m.R) for m in scaled) < 1e-6
-
-
 def test_brute_force_finds_no_other_minimum() -> None:
     Q = wishart(0)
     found = rotation_minima.minima(Q)

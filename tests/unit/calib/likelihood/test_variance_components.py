@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from ftcalib.likelihood.explanation import _prune, rivals, select_explanation, with_slopes_instead
+from ftcalib.likelihood.explanation import _prune, rivals
 from ftcalib.likelihood.session_noise import Noise, centre
 from ftcalib.likelihood.variance_components import (
     FORCE,
@@ -160,17 +160,6 @@ def test_what_others_make_needless_is_dropped() -> None:
         p = problem(rng, 40, really, np.full(len(really), 0.3))
         at = maximise(p, both, np.full(2, 0.1))
         assert _prune(p, at, needed).components == kept
-
-
-def test_a_linear_drift_is_preferred_where_it_fits_better() -> None:
-    rng = np.random.default_rng(9)
-    p = problem(rng, 30, (), np.zeros(0))
-    p.r[:, :3] += centre(p.time)[:, None] * [2.0, -1.5, 1.0]
-    at = select_explanation(p, [], np.zeros(0), [WALK_FORCE])
-    assert [c.kind for c in with_slopes_instead(p, at, 0).components] == ["slope"]
-    q = problem(rng, 30, (WALK_FORCE,), np.array([0.2]))
-    at = select_explanation(q, [], np.zeros(0), [WALK_FORCE])
-    assert with_slopes_instead(q, at, 0) is at
 
 
 def test_unknown_noise_widens_sigma_like_students_distribution() -> None:
