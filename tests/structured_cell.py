@@ -153,11 +153,6 @@ class Load:
         inertia = kg * np.mean([p @ p * np.eye(3) - np.outer(p, p) for p in points], axis=0)
         return cls(float(kg), lever_m * along / np.linalg.norm(along), inertia)
 
-    def with_part(self, kg: float, p_sensor_m: Array) -> "Load":
-        """Return the load with a point mass."""
-        total = self.kg + kg
-        return Load(total, (self.kg * self.p_sensor_com_m + kg * p_sensor_m) / total, self.inertia_kg_m2)
-
 
 class _Polynomial:
     """Squares and cubes of three values and products of them: of norm 1, root mean square, over the unit sphere."""

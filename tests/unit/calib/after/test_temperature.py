@@ -1,12 +1,9 @@
 """The bias against temperature: what the fit finds, what it takes for chance, and what it applies."""
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
-from scipy.linalg import null_space
-from scipy.stats import f, multivariate_normal
 
 from ftcalib.after.series import BiasTemperature, bias_temperature
 from ftcalib.after.state import with_bias_change
@@ -17,9 +14,6 @@ from tests.unit.ftdrive.stream.simulated import calibrated
 ONES = np.repeat([1.0, 0.03], 3)
 SLOPE = 0.1 * ONES
 NOISE = 0.02 * ONES
-
-SHARES = np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.5])
-"""Standard deviations that are tried, relative to the spread of the residuals."""
 
 
 def fitted(seed: int, slope: Array, n: int = 12, scatter: float = 0.1, walk: float = 0.3) -> BiasTemperature:
@@ -41,58 +35,9 @@ def test_a_slope_is_found_within_its_sigma_and_predicts() -> None:
     assert np.mean([one.error[0] for one in found]) < 0.5 * np.mean([one.error_without[0] for one in found])
 
 
-def restricted(y: Array, X: Array, V: Array) -> float:
-    """Log likelihood of what no column of X explains: of contrasts, up to a constant."""
-    K = null_space(X.T)
-    return float(sum(multivariate_normal.logpdf(K.T @ one, cov=K.T @ V @ K) for one in y.T))
-
-
-def test_scatter_and_walk_are_averaged_by_their_likelihood() -> None:
-    rng = np.random.default_rng(3)
-    n = 7
-    t_days, T = np.sort(rng.uniform(5, 60, n)), rng.uniform(20, 36, n)
-    y = (
-        0.05 * np.outer(T, [1, -1, 2])
-        + np.cumsum(0.3 * rng.normal(size=(n, 3)), axis=0)
-        + 0.2 * rng.normal(size=(n, 3))
-    )
-    sigma = rng.uniform(0.05, 0.3, (n, 6))
-    found = bias_temperature(t_days, T, np.hstack([y, y]), sigma)
-    assert found is not None
-    since = (t_days - t_days[0]) / (t_days[-1] - t_days[0])
-    rms = []
-    for X in (np.column_stack([np.ones(n), T - T.mean()]), np.ones((n, 1))):
-        left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
-        spread = np.sqrt(np.mean(left**2))
-        weights, slopes, variances, misses = [], [], [], []
-        for scatter, walk in product(SHARES * spread, repeat=2):
-            V = np.diag(np.mean(sigma[:, :3] ** 2, axis=1) + scatter**2) + walk**2 * np.minimum.outer(since, since)
-            W = np.linalg.inv(V)
-            C = np.linalg.inv(X.T @ W @ X)
-            weights.append(restricted(y, X, V))
-            slopes.append((C @ X.T @ W @ y)[-1])
-            variances.append(C[-1, -1])
-            missed = []
-            for i in range(n):
-                others = np.arange(n) != i
-                Wo, Xo = np.linalg.inv(V[np.ix_(others, others)]), X[others]
-                x = np.linalg.solve(Xo.T @ Wo @ Xo, Xo.T @ Wo @ y[others])
-                missed.append(y[i] - X[i] @ x - V[i, others] @ Wo @ (y[others] - Xo @ x))
-            misses.append(missed)
-        w = np.exp(np.array(weights) - max(weights))
-        w /= w.sum()
-        mean = w @ np.array(slopes)
-        if X.shape[1] == 2:
-            error = np.sqrt(w @ np.array(variances) + w @ (np.array(slopes) - mean) ** 2)
-            np.testing.assert_allclose(found.slope[:3], mean, rtol=1e-6)
-            np.testing.assert_allclose(found.sigma[:3], error, rtol=1e-6)
-            assert found.p_value[0] == pytest.approx(f.sf(np.mean((mean / error) ** 2), 3, 3 * (n - 2)))
-        rms.append(np.sqrt(np.mean(np.tensordot(w, np.array(misses), 1) ** 2)))
-    assert (found.error[0], found.error_without[0]) == pytest.approx(rms, rel=1e-6)
-    assert (found.n, found.coldest_C, found.warmest_C) == (n, T.min(), T.max())
-    later = bias_temperature(t_days + 100, T, np.hstack([y, y]), sigma)
-    assert later is not None
-    np.testing.assert_allclose(later.slope, found.slope)
+def test_a_walk_is_not_taken_for_a_temperature() -> None:
+    found = [fitted(seed, np.zeros(6)) for seed in range(8)]
+    assert sum(any(one.predicts) for one in found) <= 1
 
 
 def test_few_runs_or_one_temperature_show_nothing() -> None:

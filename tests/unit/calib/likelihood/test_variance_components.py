@@ -7,11 +7,10 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from ftcalib.likelihood.explanation import _prune, rivals
+from ftcalib.likelihood.explanation import _prune
 from ftcalib.likelihood.session_noise import Noise, centre
 from ftcalib.likelihood.variance_components import (
     FORCE,
-    HYSTERESIS,
     RESPONSE,
     ROTATION,
     TORQUE,
@@ -21,7 +20,6 @@ from ftcalib.likelihood.variance_components import (
     estimates_of_unknown_variances,
     expected_variances,
     maximise,
-    mixture_covariance,
     parameter_estimates,
     point,
     score,
@@ -216,27 +214,3 @@ def test_the_expected_white_noise_is_that_of_a_normal_likelihood_and_a_uniform_s
     most = np.sqrt(variance + 9 / np.sqrt(curvature) + 2 * abs(gradient) / curvature)
     mean = quad(lambda s: s**2 * density(s), 0, most)[0] / quad(density, 0, most)[0]
     np.testing.assert_allclose(expected_variances(p, at), max(mean, variance), rtol=1e-2)
-
-
-def test_other_variances_are_right_by_the_odds_of_their_likelihood() -> None:
-    rng, n = np.random.default_rng(5), 30
-    p, turn, response = small(n, 0), rng.normal(size=(n, 6, 3)), rng.normal(size=(n, 6, 11))
-    r = 0.2 * rng.normal(size=(n, 6)) + response[..., :5] @ (0.04 * rng.normal(size=5))
-    r += (turn @ (0.03 * rng.normal(size=(n, 3, 1))))[..., 0]
-    effects = {**p.effects, "gain": response[..., :5], "cross_talk": response[..., 5:]}
-    p = replace(p, turn=turn, effects=effects, r=r, D=np.tile(0.04 * np.eye(6), (n, 1, 1)))
-    best = maximise(p, (GAINS, ROTATION), np.full(2, 0.02**2))
-    found = rivals(p, best, [GAINS, CROSS_TALK, ROTATION, HYSTERESIS])
-    (added, _), (alike, _), (lagging, _) = found
-    assert added.components == (GAINS, ROTATION, HYSTERESIS)
-    assert dict(zip(alike.components, alike.theta, strict=True))[CROSS_TALK] == best.theta[0]
-    assert lagging.components == (GAINS, HYSTERESIS)
-    rest = 1 - sum(share for _, share in found)
-    bonus = (0.0, 0.0, -1.0)  # hysteresis must bring more than the rotations in whose place it is
-    for (other, share), less in zip(found, bonus, strict=True):
-        assert share / rest == pytest.approx(np.exp(min(other.loglik - best.loglik + less, 0.0)))
-    x, C = parameter_estimates(best)
-    y, D = parameter_estimates(lagging)
-    np.testing.assert_allclose(
-        mixture_covariance(best, [(lagging, 0.25)]), 0.25 * (D - C + np.outer(y - x, y - x)), atol=1e-12
-    )

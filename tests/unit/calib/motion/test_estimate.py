@@ -158,30 +158,6 @@ def test_a_step_is_that_of_generalised_least_squares(posed: Posed, off: tuple[st
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "tried"),
-    [
-        ("gain", (1.6e-3, 1.6e-2)),
-        ("cross_talk", (1.7e-3, 6e-2)),
-        ("walk_Nm", (2.8e-5, 1.3e-3)),
-        ("slow_N", (1.6e-4, 0.63)),
-        ("cable_N", (1.6e-4, 0.63)),
-        ("load_Nm", (6e-6, 2e-2)),
-        ("rotation_rad", (1.6e-6, 6e-3)),
-    ],
-)
-def test_the_likelihood_of_a_size_is_that_of_the_whole_solution(
-    posed: Posed, name: str, tried: tuple[float, float]
-) -> None:
-    problem, load, effects = posed
-    sums = problem.sums(load, effects, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
-    sizes = {"cross_talk": 3e-3, "walk_N": 0.05, "slow_Nm": 2e-3, "rotation_rad": 1e-3, "cable_N": 0.02}
-    found = problem.criteria(name, np.array(tried), sizes, sums, load, effects)
-    at_zero = problem.solve({**sizes, name: 0.0}, sums, load, effects).criterion
-    expected = [problem.solve({**sizes, name: size}, sums, load, effects).criterion - at_zero for size in tried]
-    np.testing.assert_allclose(found, expected, atol=1e-3)
-
-
 def slowly_turned(rows: MotionRows) -> MotionRows:
     """The same rows in the order of a smooth path through their orientations."""
     order = np.argsort(rows.motion.R_base_flange[:, 2, 0])
