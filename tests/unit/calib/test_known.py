@@ -1,4 +1,4 @@
-"""Known values in the form of the solver: derivatives, free directions, and starts that respect them."""
+"""Known values in the form of the solver: derivatives, and starts that respect them."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The onset of a drift: found in time, and neither an offset nor a step nor scatter is one."""
+"""The onset of a drift: found in time, and neither an offset nor a step is one."""
 
 import numpy as np
 import pytest

@@ -13,7 +13,7 @@ from ftcalib.judge.session_change import KINDS, SessionChange, _likeliest_change
 from ftcalib.judge.verdict import Case, statistics
 from ftcalib.likelihood.fit import fit
 from ftcalib.likelihood.session import LEVER_M
-from ftcalib.model import Parameters, SPECIAL_R_flange_base, jacobian, predict
+from ftcalib.model import Parameters, SPECIAL_R_flange_base, predict
 from ftcalib.solver import _find_change
 from tests.structured_cell import CELLS, Cell, flange, tour
 
@@ -154,18 +154,6 @@ def test_a_change_is_as_large_as_it_is_and_can_be_undone(
     assert np.sqrt(np.mean((left / SIGMA) ** 2)) < 0.1
     if measured:
         assert change.misfit < 1e-3
-
-
-def test_the_likelihood_is_that_of_the_dense_covariance_less_what_components_must_bring() -> None:
-    rng = np.random.default_rng(7)
-    wrench = predict(TOOL, ORIENTATIONS) + rng.normal(0, SIGMA, (24, 6))
-    wrench += np.cumsum(rng.normal(0, 5 * SIGMA, (24, 6)), axis=0)
-    found = fit(ORIENTATIONS, wrench, np.diag(SIGMA**2), drift="random-walk")
-    assert found.components.keys() == {"walk_force_N", "walk_torque_Nm"}
-    W = found.noise.solve(np.eye(144).reshape(24, 6, 144)).reshape(144, 144)
-    J, e = jacobian(found.parameters, ORIENTATIONS).reshape(144, 15), found.residuals.ravel()
-    logdet = np.linalg.slogdet(J.T @ W @ J)[1] - np.linalg.slogdet(W)[1]
-    assert found.minus_two_log_likelihood == pytest.approx(logdet + e @ W @ e + 2 * (2 + 2), abs=1e-4)
 
 
 def zeroed(places: list[int], seed: int, n: int = 24) -> CalibrationResult:

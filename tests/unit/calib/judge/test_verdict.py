@@ -1,4 +1,4 @@
-"""The judgement: cross-validation that is exact, chances that are as stated, and every finding where it is true."""
+"""The judgement: chances that are as stated, and every finding where it is true."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -84,32 +84,7 @@ def the(code: str, judged: Quality | CalibrationResult) -> Finding:
     return finding
 
 
-# Cross-validation
-
-
-def test_left_out_residuals_are_those_of_real_refits() -> None:
-    rng = np.random.default_rng(1)
-    R = Rotation.random(8, rng=rng).as_matrix()
-    A = rng.normal(size=(8, 6, 9))
-    cov = SIGMA[:, None] * SIGMA * (A @ np.swapaxes(A, 1, 2)) / 9e4  # correlated, uneven, small: the model is linear
-    wrench = predict(TRUTH, R) + (np.linalg.cholesky(cov) @ rng.normal(size=(8, 6, 1)))[..., 0]
-    best = gauss_newton(R, wrench, cov)
-    fitted = Estimate.independent(best, np.eye(15), R, wrench, cov, np.ones(8), measured=True)
-    left_out, left_out_cov = fitted.left_out_residuals, fitted.left_out_cov
-    for k in range(8):
-        others = np.arange(8) != k
-        refit = gauss_newton(R[others], wrench[others], cov[others])
-        error = wrench[k] - predict(refit, R[k])
-        sigma = np.sqrt(np.diag(left_out_cov[k]))
-        np.testing.assert_allclose(left_out[k] / sigma, error / sigma, atol=1e-3)
-        np.testing.assert_allclose(left_out[k], error, atol=1e-4 * float(np.linalg.norm(error)))
-        J = (np.linalg.inv(np.linalg.cholesky(cov[others])) @ jacobian(refit, R[others])).reshape(-1, 15)
-        J_k = jacobian(refit, R[k])
-        np.testing.assert_allclose(
-            left_out_cov[k] / np.outer(sigma, sigma),
-            (cov[k] + J_k @ np.linalg.inv(J.T @ J) @ J_k.T) / np.outer(sigma, sigma),
-            atol=1e-3,
-        )
+# Statistics
 
 
 def test_a_pose_that_nothing_checks_is_named() -> None:
@@ -118,9 +93,6 @@ def test_a_pose_that_nothing_checks_is_named() -> None:
     quality = judge(fit(R, noisy(np.random.default_rng(4), R), white(10)))
     assert the("poses_unchecked", quality).values == {"poses": [10]}
     assert quality.verdict != "good"
-
-
-# Statistics
 
 
 def test_p_values_are_uniform_and_clean_runs_are_good_without_a_finding() -> None:
@@ -264,13 +236,8 @@ def test_nothing_is_suspected_of_a_sound_sensor() -> None:
         assert not DISAGREE & set(codes(solved(R, wrench)))
 
 
-# Limits
-
-
 FITTED = fit(R24, noisy(np.random.default_rng(30), R24), white(24))
 WEIGHT_N = FITTED.parameters.weight_N
-
-
 SMOOTH = {"response_not_linear", "cable_acts", "orientations_smoothly_off"}
 
 
@@ -291,7 +258,7 @@ def test_a_smooth_error_limits_from_a_fifth_of_a_percent_of_the_weight_on(
     assert [(one.code, one.severity) for one in named if one.code in SMOOTH] == found
 
 
-# Real sessions
+# Rounding, drift and real sessions
 
 
 @pytest.mark.parametrize("timed", [True, False])

@@ -1,4 +1,4 @@
-"""Maximum likelihood: as good as the data allow, in the right basin, with the noise the data show."""
+"""Maximum likelihood: in the right basin, predictions of left-out poses, with the noise the data show."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.descent import Descent, Statistics, coefficients, coefficients_derivative, features, wrench_gram
 from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.session import Drift
-from ftcalib.likelihood.session_noise import CHUNK, Noise, inverse_blocks, summed_products
+from ftcalib.likelihood.session_noise import CHUNK, Noise, summed_products
 from ftcalib.likelihood.variance_components import squared_length
 from ftcalib.model import Array, jacobian, predict
 
@@ -106,7 +106,7 @@ def test_statistics_give_the_normal_equations_of_the_data() -> None:
         np.testing.assert_allclose(ours, other, atol=1e-8 * np.abs(other).max())
 
 
-# Efficiency and basins
+# Basins
 
 
 @pytest.mark.parametrize(("n", "degrees", "weight_in_sigma"), [(6, 180, 10), (12, 40, 30)])
@@ -314,7 +314,7 @@ def test_impossible_knowledge_is_refused(fields: dict[str, object], words: str) 
         Known(**fields)  # type: ignore[arg-type]  # the point of the test
 
 
-# Covariances from few samples
+# Many poses, and readings below the resolution
 
 
 def test_many_poses_are_predicted_in_parts_as_they_would_be_at_once() -> None:
@@ -329,21 +329,6 @@ def test_many_poses_are_predicted_in_parts_as_they_would_be_at_once() -> None:
     residuals = np.einsum("nij,nj->ni", others, best.residuals)
     np.testing.assert_allclose(best.left_out_residuals, residuals, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(best.left_out_cov, others @ WHITE, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("n", [1, 6])
-def test_the_blocks_of_the_inverse_are_those_of_the_dense_one(n: int) -> None:
-    rng = np.random.default_rng(n)
-    diagonal, above = rng.normal(size=(n, 3, 3)), rng.normal(size=(n - 1, 3, 3))
-    diagonal = diagonal @ np.swapaxes(diagonal, 1, 2) + 12 * np.eye(3)
-    dense = np.zeros((n, 3, n, 3))
-    dense[range(n), :, range(n)] = diagonal
-    dense[range(n - 1), :, range(1, n)] = above
-    dense[range(1, n), :, range(n - 1)] = np.swapaxes(above, 1, 2)
-    inverse = np.linalg.inv(dense.reshape(3 * n, 3 * n)).reshape(n, 3, n, 3)
-    own, beside = inverse_blocks(diagonal, above)
-    np.testing.assert_allclose(own, inverse[range(n), :, range(n)], atol=1e-12)
-    np.testing.assert_allclose(beside, inverse[range(n - 1), :, range(1, n)], atol=1e-12)
 
 
 def test_residuals_below_what_a_sensor_resolves_are_the_noise() -> None:

@@ -1,4 +1,4 @@
-"""Gain and cross-talk of the sensor: found where they are, applied, kept in the file."""
+"""Gain and cross-talk of the sensor: found where they are, and applied."""
 
 import numpy as np
 import pytest

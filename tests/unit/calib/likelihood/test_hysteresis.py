@@ -1,4 +1,4 @@
-"""Hysteresis of the last swing: found where it is, honest, and no part of the prediction."""
+"""Hysteresis of the last swing: found where it is, with sigmas that hold."""
 
 import numpy as np
 import pytest

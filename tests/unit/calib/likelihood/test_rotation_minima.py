@@ -1,4 +1,4 @@
-"""All minima over the rotations, checked against least squares, brute force and symmetry; and the proof, on and off."""
+"""All minima over the rotations, checked against least squares and brute force; and the proof."""
 
 from itertools import permutations, product
 

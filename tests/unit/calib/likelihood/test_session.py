@@ -1,4 +1,4 @@
-"""A session before the fit: what is open, what counts as noise, and which components the data may show."""
+"""A session before the fit: what is open, what is exact, and which components the data may show."""
 
 import numpy as np
 import pytest

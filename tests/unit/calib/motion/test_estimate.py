@@ -1,4 +1,4 @@
-"""The fit of rows in motion: its equations against dense ones, the rows that it leaves out, and what it states."""
+"""The fit of rows in motion: its equations against dense ones, and what it states."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What a recording in motion shows beside its fit: a coarse delay, contacts, ranges, and what is missing."""
+"""What a recording in motion shows beside its fit: a coarse delay, another height, and what is missing."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Residuals in units of their covariance, and the drift until the next use."""
+"""The drift until the next use."""
 
 from types import SimpleNamespace
 from typing import cast
