@@ -7,7 +7,7 @@ from time import sleep  # by name: the controller in memory replaces that of the
 
 import pytest
 
-from ftdrivers.clock import REAL, Follower
+from ftdrivers.clock import Follower
 from ftdrivers.errors import ConnectError
 from ftdrivers.interfaces import DeviceInfo, FtSamples
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor
@@ -52,12 +52,6 @@ class Sensor(StreamingSensor):
         self.followers = tuple(self._clock.following)
 
 
-def test_a_sensor_is_timed_only_when_its_reader_follows_the_clock() -> None:
-    sensor = Sensor("fake", clock=SlowToClaim())
-    with sensor:
-        assert sensor.followers == ("MainThread", "reader of fake")
-
-
 def test_an_arm_is_timed_only_when_its_reader_follows_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SlowToClaim()
     controller = Controller(clock)
@@ -85,9 +79,3 @@ def test_a_clock_that_has_no_place_left_ends_the_start() -> None:
     with pytest.raises(ConnectError):
         follower.start()
     follower.join()
-
-
-def test_no_device_is_behind_the_clock_of_the_computer() -> None:
-    assert REAL.lead_s == 0
-    assert not REAL.can_be_held
-    assert REAL.patience_s(1.5) == 1.5

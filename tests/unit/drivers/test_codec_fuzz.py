@@ -17,8 +17,3 @@ def test_an_undocumented_exception_is_found() -> None:
     outcome = fuzz(Target("careless", lambda data: data[12], bytes(13)), 1000)
     assert "IndexError" in outcome.undocumented
     assert not outcome.passed
-
-
-def test_growing_memory_is_found() -> None:
-    kept: list[bytes] = []
-    assert not fuzz(Target("hoarder", lambda data: kept.append(data * 10), bytes(13)), 1000, batch=100).passed

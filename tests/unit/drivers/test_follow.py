@@ -1,7 +1,5 @@
 """What one follower has not read yet: as many samples as may wait are read, one more is an error."""
 
-import weakref
-
 import pytest
 
 from ftdrivers.errors import StreamBroken
@@ -19,13 +17,3 @@ def test_as_many_samples_as_may_wait_are_read_and_one_more_is_an_error() -> None
     unread.put("two more", 2)
     with pytest.raises(StreamBroken, match="sensor: 4 samples are waiting to be read, and the limit is 3"):
         unread.take()
-
-
-def test_samples_that_are_too_many_take_no_memory() -> None:
-    unread: Unread[set[str]] = Unread("sensor", 3)
-    block = {"samples"}
-    gone = weakref.ref(block)
-    unread.put(block, 2)
-    del block
-    unread.put({"more"}, 2)
-    assert gone() is None

@@ -47,17 +47,6 @@ def test_pipx(prefix: Path, installed: str, wanted: str) -> None:
     assert install_command("viz") == f"pipx install --force '{wanted}'"
 
 
-def test_clone_of_uv(prefix: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    about = json.dumps({"url": prefix.as_uri(), "dir_info": {"editable": True}})
-    monkeypatch.setattr(installation, "distribution", lambda _: SimpleNamespace(read_text=lambda _: about))
-    (prefix / "uv.lock").touch()
-    assert install_command("viz") == f"'/env of mine/bin/python' -m pip install -e '{prefix}[viz]'"
-    monkeypatch.setattr(sys, "prefix", str(prefix / ".venv"))
-    assert install_command("viz") == f"uv sync --project {prefix} --inexact --extra viz"
-    monkeypatch.chdir(prefix)
-    assert install_command("viz") == "uv sync --inexact --extra viz"
-
-
 def test_pip(prefix: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert missing_extra("--png", "matplotlib", "viz") == (
         "--png needs matplotlib, of the extra viz: install it with "

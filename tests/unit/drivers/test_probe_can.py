@@ -64,11 +64,6 @@ def test_identifiers_in_use_by_something_else_are_left_alone(
         assert "://can0" in answer.what  # the address, for an operator who knows better
 
 
-def test_a_sensor_that_another_host_reads_is_found_without_a_question(probed: Probe) -> None:
-    _, (answer,) = probed(["200", "200 00000064012C01F4", "201 FF38FE70FDA8"], [], 250_000)
-    assert answer.url == "ati-can://can0?bitrate=250000"
-
-
 def test_a_sensor_that_streams_is_found_without_a_question(probed: Probe) -> None:
     _, (answer,) = probed(STREAM, [(ATI_SERIAL, [])])
     assert answer.url == "robotous-can://can0"
@@ -110,24 +105,9 @@ def test_a_sensor_that_answers_is_named(
     assert probed([], turns, bitrate)[1] == [found]
 
 
-def test_another_base_stands_in_the_address(table: Table) -> None:
-    turns = [("7F5", ["7F5 4654313233343500"]), ("7FF", ["7FF 03080002"])]
-    with table.can(turns) as wire:
-        (answer,) = probe_can("can0", interface="virtual", bitrate=500_000, base=0x7F, clock=wire.clock)
-    assert answer.url == "ati-can://can0?interface=virtual&bitrate=500000&base=0x7F"
-
-
 @pytest.mark.parametrize("whole", [4, 5])
 def test_five_whole_samples_are_enough(table: Table, whole: int) -> None:
     turns: list[tuple[str, list[str]]] = [(ATI_SERIAL, [])]
     with table.can(turns, Stream([STREAM] * whole, 0.02, has_end=False)) as wire:
         answers = probe_can("can0", interface="socketcan", bitrate=1_000_000, clock=wire.clock)
     assert [answer.url for answer in answers] == (["robotous-can://can0"] if whole == 5 else [None])
-
-
-@pytest.mark.parametrize("whole", [4, 5])
-def test_half_a_sample_of_an_ati_sensor_does_not_count(table: Table, whole: int) -> None:
-    sample = ["200 00000064012C01F4", "201 FF38FE70FDA8"]
-    with table.can([], Stream([*[sample] * whole, sample[:1]], 0.02, has_end=False)) as wire:
-        (answer,) = probe_can("can0", interface="socketcan", bitrate=250_000, clock=wire.clock)
-    assert bool(answer.url) == (whole == 5)

@@ -15,13 +15,6 @@ class Fixed(ReadOnlyArm):
         return ArmState(7, 0.5, np.zeros(6), np.zeros(6), np.eye(3), np.zeros(3))
 
 
-def test_it_is_read_and_reports_what_it_does_not_know() -> None:
-    with Fixed() as arm, arm.follow() as follow:
-        states, status = follow.read(0.1), arm.status()
-    assert (states.t_host_ns.tolist(), states.R_base_flange.shape) == ([7], (1, 3, 3))
-    assert (status.t_host_ns, status.safety_mode, status.fault, status.payload_kg) == (7, "not reported", None, None)
-
-
 def test_it_refuses_control_and_motion_and_may_be_stopped() -> None:
     arm = Fixed()
     with pytest.raises(ConnectError, match="only reads"):

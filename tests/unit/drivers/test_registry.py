@@ -11,8 +11,6 @@ from unittest.mock import Mock
 
 import pytest
 from click.testing import CliRunner
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ftdrive.cell.config import FORMAT, CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.devices import build_arm
@@ -26,13 +24,6 @@ from ftdrivers.sensors import SENSORS
 from ftdrivers.streaming.sensor import StreamingSensor
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.wires.serial_port import SerialPort
-
-
-@given(st.text(min_size=1))
-def test_any_name_of_a_port_is_read_back_from_its_address(name: str) -> None:
-    for path in (name, f"/dev/{name}"):
-        parts = split_url(f"bota://{in_url(path)}?baud=460800")
-        assert (parts.address, parts.query, parts.fragment) == (path, "baud=460800", "")
 
 
 def test_usual_names_stand_in_an_address_as_they_are() -> None:
@@ -307,13 +298,6 @@ def test_a_driver_that_is_no_stream_of_ours_takes_no_options_of_ours(install: In
     for option in ("recover=1", "range=1,1", "serial=A"):
         with pytest.raises(BadUrl, match="no options recover, serial and range"):
             sensor_from_url(f"plain://x?{option}")
-
-
-def test_arms() -> None:
-    assert arm_class() is UrArm
-    assert arm_class("ur") is UrArm
-    with pytest.raises(BadUrl, match=r"unknown arm 'kuka'; known: ros2, ur$"):
-        arm_class("kuka")
 
 
 def test_our_own_names_cannot_be_taken(install: Install) -> None:

@@ -49,31 +49,3 @@ def test_a_sensor_has_all_that_it_needs(scheme: str) -> None:
 
 def test_every_emulated_sensor_has_a_driver() -> None:
     assert {name: scheme for scheme, kind in SENSORS.items() for name in kind.emulated} == SCHEMES
-
-
-@pytest.mark.parametrize(
-    ("kind", "files"),
-    [
-        (
-            SensorKind("ftdrivers.acme.sensor:AcmeSensor", "serial"),
-            [
-                "ftdrivers.acme.sensor",
-                "tests/unit/drivers/acme",
-                "drivers/ftdrivers/sensors.py",
-                "tests/wire/sensor_kinds.py",
-                "docs/reference/sensors.md",
-            ],
-        ),
-        (
-            SensorKind("ftdrivers.ati.netft:NetFtSensor", "serial", {"acme": "Acme sensor"}),
-            [
-                "ftdrivers.ati.netft",
-                "mocks/ftmocks/sensors/catalogue.py",
-                "tests/wire/sensor_kinds.py",
-                "docs/reference/sensors.md",
-            ],
-        ),
-    ],
-)
-def test_what_a_new_sensor_lacks_is_named(kind: SensorKind, files: list[str]) -> None:
-    assert [what.partition(":")[0] for what in missing("acme-usb", kind)] == files

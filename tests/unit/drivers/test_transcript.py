@@ -1,9 +1,7 @@
 """A transcript as a file: what is written and in which order, what is refused, and what was broken off."""
 
-import itertools
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,45 +28,12 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     assert (tmp_path / "a.jsonl").read_text() == "mine"
 
 
-def test_a_folder_that_is_not_there_is_said_to_be_the_fault(tmp_path: Path) -> None:
-    path = tmp_path / "nope" / "a.jsonl"
-    with pytest.raises(OSError, match=f"^{path} cannot be written .No such file"):
-        Writer(path, {"url": "x", "duration_s": 1})
-
-
-def test_a_file_without_a_name_is_said_to_be_the_fault() -> None:
-    with pytest.raises(FileExistsError, match="give another name"):
-        Writer(Path(), {"url": "x", "duration_s": 1})
-
-
 def test_a_transcript_of_nothing_can_be_thrown_away(tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.jsonl", {"url": "x", "duration_s": 1})
     assert not writer.has_port
     writer.discard()
     writer.discard()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_bytes_of_both_directions_keep_their_order(tmp_path: Path) -> None:
-    writer = Writer(tmp_path / "a.jsonl", {"url": "x", "duration_s": 1})
-    for data in (b"\x01", b"\x02"):
-        writer.received(data)  # within 2 ms, hence one line
-    writer.sent(b"\x10")
-    writer.sent(b"\x11")
-    writer.received(b"\x03")
-    writer.end(error=None)
-    lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
-    assert lines[0]["format"] == "ftdrive.transcript/1"
-    merged = [(kind, "".join(line["hex"] for line in group)) for kind, group in by_direction(lines)]
-    assert merged == [("rx", "0102"), ("tx", "1011"), ("rx", "03")]
-    assert [line["hex"] for line in lines if line.get("dir") == "tx"] == ["10", "11"]  # one line a write
-    assert [line["t_ns"] for line in lines[1:]] == sorted(line["t_ns"] for line in lines[1:])
-    assert lines[-1]["event"] == "end"
-
-
-def by_direction(lines: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    passages = (line for line in lines if "dir" in line)
-    return ((kind, list(group)) for kind, group in itertools.groupby(passages, key=lambda line: str(line["dir"])))
 
 
 OPENED = '{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns": 1, "event": "open"}\n'

@@ -3,14 +3,13 @@
 import math
 import sys
 import threading
-import time
 from dataclasses import dataclass, field, replace
 
 import pytest
 import serial
 
 from ftdrivers.transcript import Passage, Player, Transcript
-from ftdrivers.wires.serial_port import SerialPort, ask_for_marks
+from ftdrivers.wires.serial_port import ask_for_marks
 from tests.fake_clock import FakeClock
 
 OPENED_NS = 7_000_000_000
@@ -94,25 +93,10 @@ def test_what_the_device_sends_before_a_request_that_comes_early(early_s: float,
     assert wire.answers(0.02) == b"3"
 
 
-def test_a_request_may_be_left_out_with_its_answer() -> None:
-    wire = Played(DIALOGUE)
-    wire.ask(b"cd")
-    assert wire.answers(1.0) == b"3"
-    assert wire.divergence is None
-
-
 def test_a_request_without_an_answer_may_be_left_out() -> None:
     wire = Played(recorded((0.0, True, b"ab"), (0.0, True, b"cd"), (0.01, False, b"3"), (0.02, True, b"ef")))
     wire.ask(b"cd")
     assert wire.answers(0.02) == b"3"
-
-
-def test_two_requests_may_arrive_at_once() -> None:
-    wire = Played(recorded((0.0, True, b"ab"), (0.0, True, b"cd"), (0.01, False, b"3")))
-    wire.ask(b"abcd")
-    assert wire.answers(0.02) == b"3"
-    wire.ask(b"xy")  # the driver says goodbye, or the recording was broken off
-    assert wire.divergence is None
 
 
 def test_a_request_that_was_not_recorded_ends_in_silence_with_a_reason() -> None:
@@ -123,19 +107,6 @@ def test_a_request_that_was_not_recorded_ends_in_silence_with_a_reason() -> None
     assert wire.answers(1.0) == b""
     wire.ask(b"cd")
     assert wire.answers(1.0) == b""
-
-
-def test_what_comes_unasked_keeps_its_times_and_waits_while_the_driver_is_full() -> None:
-    wire = Played(recorded((0.1, False, b"1"), (0.2, False, b"2")))
-    assert wire.answers(0.11) == b"1"
-    wire.far.is_full = True
-    assert wire.play() == pytest.approx(0.09)
-    wire.clock.advance(0.1)
-    wire.far.sent.clear()
-    assert wire.play() == pytest.approx(0.001)  # a look each millisecond
-    assert wire.far.sent == [b"", b"2"]  # the rest first
-    wire.far.is_full = False
-    assert wire.play() == math.inf
 
 
 def test_a_driver_is_answered_on_a_pseudo_terminal_until_it_closes_it() -> None:
@@ -152,33 +123,6 @@ def test_a_driver_is_answered_on_a_pseudo_terminal_until_it_closes_it() -> None:
         assert not thread.is_alive()
 
 
-def read_through(player: Player, request: bytes, size: int) -> tuple[bytes, list[int]]:
-    with player as path:
-        port = SerialPort("sensor", path, 1_250_000, even_parity=True)
-        port.open()
-        try:
-            port.write(request)
-            data, damaged, deadline = b"", list[int](), time.monotonic() + 5
-            while len(data) < size:
-                assert time.monotonic() < deadline
-                more, places = port.read_marked(size - len(data))
-                damaged += [len(data) + place for place in places]
-                data += more
-        finally:
-            port.close()
-    return data, damaged
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
-@pytest.mark.parametrize(
-    ("parity_marks", "read", "damaged"), [(True, b"ab\xffc", [1]), (False, b"a\xff\x00b\xff\xffc", [])]
-)
-def test_recorded_marks_are_played_as_marks(parity_marks: bool, read: bytes, damaged: list[int]) -> None:
-    marked = recorded((0.00, True, b"?"), (0.01, False, b"a\xff\x00b\xff\xffc"))
-    player = Player(replace(marked, parity_marks=parity_marks))
-    assert read_through(player, b"?", len(read)) == (read, damaged)
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
 def test_marks_are_not_played_before_the_driver_is_ready_for_them() -> None:
     marked = recorded((0.00, True, b"?"), (0.01, False, b"\xff\x00b"))
@@ -187,25 +131,6 @@ def test_marks_are_not_played_before_the_driver_is_ready_for_them() -> None:
         assert port.read(1) == b""  # it has not asked for marks
         ask_for_marks(port)
         assert port.read(3) == b"\xff\x00b"
-
-
-def test_a_player_that_is_never_opened_ends() -> None:
-    before = threading.active_count()
-    with Player(DIALOGUE):
-        pass
-    assert threading.active_count() == before
-
-
-def test_how_much_is_left() -> None:
-    wire = Played(DIALOGUE)
-    assert wire.left_s == pytest.approx(0.31)
-    wire.ask(b"ab")
-    assert wire.left_s == pytest.approx(0.26)
-    wire.answers(0.1)
-    assert wire.left_s == pytest.approx(0.06)
-    wire.ask(b"cd")
-    wire.answers(0.1)
-    assert wire.left_s == 0
 
 
 def test_frames_are_played_by_an_adapter_whose_commands_are_left_out() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from ftdrivers.ati.can import AtiCanSensor
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, StreamBroken
 from ftdrivers.interfaces import Fact
 from tests.unit.drivers.dialogue import CanWire, Table
 from tests.unit.drivers.in_one_thread import InOneThread
@@ -83,16 +83,6 @@ def test_start_up_is_golden_and_then_only_gauges_are_asked(make_wire: MakeWire) 
     assert (samples.counts == COUNTS).all()
     assert (np.diff(samples.seq) == 1).all()
     assert len(samples) == pytest.approx(100, abs=20)  # polled at 1 kHz at most
-
-
-def test_polls_are_a_millisecond_apart_and_the_next_one_leaves_before_the_last_is_decoded(make_wire: MakeWire) -> None:
-    wire = make_wire(last=[(0.1, GAUGES[0]), (0.2, GAUGES[1])])
-    with opened(wire) as sensor:
-        assert len(sensor.collect(0.1)) == pytest.approx(100, abs=2)
-    wire = make_wire(last=[(2.0, GAUGES[0]), (2.1, GAUGES[1])])  # a slow one is asked as often as it can answer
-    with opened(wire) as sensor:
-        assert len(sensor.collect(0.105)) == pytest.approx(50, abs=2)
-    left_alone(wire)
 
 
 @pytest.mark.parametrize(
@@ -208,34 +198,6 @@ def test_stale_frames_are_purged_before_a_request(make_wire: MakeWire) -> None:
         assert (sensor.collect(0.05).counts == COUNTS).all()
 
 
-@pytest.mark.parametrize("frames", [["200 0000000100020003", *GAUGES], ["201 000400050006", *GAUGES]])
-def test_halves_of_two_readings_are_no_sample(make_wire: MakeWire, frames: list[str]) -> None:
-    mixed = [(1.0 + 0.5 * number, frame) for number, frame in enumerate(frames)]
-    with opened(make_wire(polls=[GAUGES, mixed])) as sensor:
-        samples = sensor.collect(0.1)
-        assert (samples.counts == COUNTS).all()
-        assert (sensor.health().lost, sensor.health().malformed) == (1, 1)
-
-
-@pytest.mark.parametrize(("after_ms", "lost"), [(49.0, 0), (51.0, 1)])
-def test_a_poll_is_answered_within_fifty_milliseconds(make_wire: MakeWire, after_ms: float, lost: int) -> None:
-    late = [(1.0, GAUGES[0]), (after_ms, GAUGES[1])]
-    wire = make_wire(polls=[GAUGES, late])
-    with opened(wire) as sensor:
-        samples = sensor.collect(0.15)
-        assert (samples.counts == COUNTS).all()
-        assert sensor.health().lost == lost
-    left_alone(wire)
-
-
-def test_a_poll_that_this_computer_looks_at_late_is_answered_all_the_same(make_wire: MakeWire) -> None:
-    wire = make_wire(polls=[GAUGES])
-    with opened(wire) as sensor:
-        wire.clock.at(0.0105, lambda: wire.clock.stall(0.2))  # between question and answer
-        assert len(sensor.collect(0.1))
-        assert sensor.health().lost == 0
-
-
 def test_a_half_that_is_late_does_not_pair_up_with_the_next_reading(table: Table) -> None:
     late = [(1.0, GAUGES[0]), (53.0, "201 000400050006")]
     half = [(10.0, GAUGES[0])]
@@ -248,25 +210,6 @@ def test_a_half_that_is_late_does_not_pair_up_with_the_next_reading(table: Table
         assert sensor.health().lost == 2
         assert samples.seq[0] == 4
     left_alone(wire)
-
-
-def test_sensor_that_stops_answering_is_silent_after_three_tenths_of_a_second(table: Table) -> None:
-    mute: repeat[tuple[str, Answer]] = repeat(("200", []))
-    wire = table.can(chain(START_UP.items(), [("200", GAUGES)] * 20, mute))
-    with opened(wire) as sensor:
-        start_s = wire.clock.now_s()
-        sensor._select_slot = lambda: None  # type: ignore[method-assign]
-        with pytest.raises(DeviceTimeout):
-            sensor.collect(1.0)
-        assert wire.clock.now_s() - start_s == pytest.approx(0.32, abs=0.05)
-
-
-def test_a_missing_device_is_known_after_three_attempts(table: Table) -> None:
-    with table.can([("205", [])] * 3) as wire:
-        start_s = wire.clock.now_s()
-        with pytest.raises(ConnectError, match="SERIAL"):
-            opened(wire).open()
-        assert wire.clock.now_s() - start_s == pytest.approx(0.3, abs=0.01)
 
 
 @pytest.mark.parametrize(("after_ms", "asked"), [(99.0, 1), (101.0, 2), (None, 2)])

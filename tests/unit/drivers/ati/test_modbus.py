@@ -9,11 +9,7 @@ from hypothesis import strategies as st
 
 from ftdrivers.ati import modbus
 from ftdrivers.errors import ProtocolError
-from ftdrivers.wires.framing import describe_status
-from ftdrivers.wires.modbus import Refused
 
-V1 = bytes.fromhex("00 64 01 2C 01 F4 FF 38 FE 70 FD A8 50")
-V2 = bytes.fromhex("00 DD 00 45 09 26 FC 62 FB C2 04 F2 62")
 i16 = st.integers(-32768, 32767)
 
 
@@ -33,15 +29,6 @@ i16 = st.integers(-32768, 32767)
 def test_wrong_replies_are_refused(request_: bytes, reply: str, message: str) -> None:
     with pytest.raises(ProtocolError, match=message):
         modbus.check_reply(request_, bytes.fromhex(reply))
-
-
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [(1, "illegal function"), (2, "illegal register"), (3, "illegal value"), (4, "device failure or locked")],
-)
-def test_a_refusal_has_the_words_of_the_protocol(code: int, words: str) -> None:
-    with pytest.raises(Refused, match=words):
-        modbus.check_reply(modbus.read_registers(modbus.STATUS, 1), modbus.frame(0x83, bytes([code])))
 
 
 def block(**change: bytes) -> bytes:
@@ -86,19 +73,6 @@ def test_where_calibrations_are_stored() -> None:
     assert modbus.calibration_reads(16)[0] == (0x0C23, 64)
 
 
-def test_stream_records() -> None:
-    records = modbus.decode_records(V1 + V2 + V1[:12] + b"\xd0" + V1[:12] + b"\x51" + bytes(13))
-    assert records.gauges.tolist() == [
-        [100, -200, 300, -400, 500, -600],
-        [221, -926, 69, -1086, 2342, 1266],
-        [100, -200, 300, -400, 500, -600],
-        [100, -200, 300, -400, 500, -600],
-        [0] * 6,
-    ]
-    assert records.intact.tolist() == [True, True, True, False, True]
-    assert records.error.tolist() == [False, False, True, False, False]
-
-
 @given(st.lists(st.tuples(st.tuples(i16, i16, i16, i16, i16, i16), st.booleans())))
 def test_records_round_trip(rows: list[tuple[tuple[int, ...], bool]]) -> None:
     data = b""
@@ -132,29 +106,3 @@ def test_which_records_are_believed(seen: str, kept: str, slipped: bool) -> None
     keep, settled, slip = modbus.keep_records(np.array([c == "g" for c in seen], dtype=bool))
     assert "".join("k" if k else "-" for k in keep) == kept
     assert (settled, slip) == (len(kept), slipped)
-
-
-@given(st.text("gb", max_size=200), st.integers(3, 40))
-def test_judging_in_batches_settles_like_judging_at_once(seen: str, batch: int) -> None:
-    intact = np.array([c == "g" for c in seen], dtype=bool)
-    whole, _, slipped_whole = modbus.keep_records(intact)
-    kept: list[bool] = []
-    waiting = np.zeros(0, dtype=bool)
-    for start in range(0, len(intact), batch):
-        waiting = np.concatenate([waiting, intact[start : start + batch]])
-        keep, settled, slipped = modbus.keep_records(waiting)
-        kept += keep.tolist()
-        waiting = waiting[settled:]
-        if slipped:
-            break
-    else:
-        slipped = False
-    assert slipped == slipped_whole
-    assert kept == whole.tolist()
-
-
-@pytest.mark.parametrize(
-    ("bit", "words"), [(1, "voltage too high"), (7, "EEPROM"), (11, "thermistor too high"), (12, "thermistor too low")]
-)
-def test_status_bits_have_the_numbers_of_the_manual(bit: int, words: str) -> None:
-    assert words in describe_status(1 << bit, modbus.STATUS_BITS)

@@ -6,7 +6,6 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Self
 
@@ -14,18 +13,12 @@ import numpy as np
 import pytest
 
 from ftdrivers.ati.netft import (
-    AXIA_BITS,
-    NET_FT_BITS,
-    ONROBOT_BITS,
     NetFtSensor,
-    numbers_in,
-    text_in,
     transformation_in,
 )
-from ftdrivers.errors import BadUrl, ConnectError, DeviceFault, StreamBroken
-from ftdrivers.interfaces import Fact, Health
+from ftdrivers.errors import BadUrl, ConnectError, DeviceFault
+from ftdrivers.interfaces import Fact
 from ftdrivers.registry import sensor_from_url
-from ftdrivers.wires.framing import describe_status
 from tests.cell_time import CellTime
 
 START, STOP = bytes.fromhex("1234 0002 0000 0000"), bytes.fromhex("1234 0000 0000 0000")
@@ -144,26 +137,6 @@ def test_start_stop_and_record_are_golden() -> None:
     assert info.facts["counts_per_N"] == Fact(1e6, "device")
 
 
-def test_onrobot_scale_is_the_manuals() -> None:
-    with Box() as box, box.sensor(onrobot=True) as sensor:
-        np.testing.assert_allclose(sensor.latest(timeout_s=0.5).wrench[0], [150, -225, 1000, 1, -0.5, 0.25])
-        assert sensor.identify().model == "OnRobot HEX (Ethernet)"
-        assert sensor.identify().facts["counts_per_Nm"] == Fact(100_000, "documented")
-
-
-def test_lost_requests_are_repeated() -> None:
-    with Box(deaf=2) as box, box.sensor() as sensor:
-        sensor.collect(0.05)
-
-
-def test_gaps_are_lost_and_doubled_or_late_datagrams_are_no_samples() -> None:
-    with Box(*map(record, [1, 2, 2, 3, 5, 4, 6, 10, 11])) as box, box.sensor() as sensor:
-        samples = sensor.collect(0.1)
-        health = sensor.health()
-    assert (np.diff(samples.seq) >= 1).all()
-    assert health.lost == 4  # 7, 8, 9, and 4, which came late
-
-
 @pytest.mark.parametrize(
     ("status", "says"),
     [(0x88000000, r"0x88000000 \(bit 27: gauge out of range, bit 31: any error\)"), (0x04000000, "gauge near")],
@@ -173,42 +146,6 @@ def test_a_fault_in_the_stream_is_named(status: int, says: str) -> None:
         box.records = [record(100_000, status)]
         with pytest.raises(DeviceFault, match=says):
             sensor.collect(1.0)
-
-
-def test_silence_ends_the_stream() -> None:
-    with Box() as box, box.sensor() as sensor:
-        box.mute = True
-        heard_s = sensor.latest(timeout_s=0.5).t_host_ns[0] / 1e9
-        with pytest.raises(StreamBroken, match=r"ended \(nothing arrived for 0\.3"):
-            sensor.collect(60.0)
-        # The silence ended it, not the time of `collect`; a busy computer adds to the 0.3 s.
-        assert 0.3 <= box.time.of_drivers.now_s() - heard_s < 30
-
-
-def test_what_was_thrown_away_is_counted_since_open() -> None:
-    with Box(*map(record, [1, 2, 2, 3, 5, 4, 6]), RECORD[:-1]) as box:
-        sensor = box.sensor()
-        sensor.recover = True
-        counted: list[tuple[int, int, int]] = []
-
-        def wait_for(condition: Callable[[Health], bool]) -> None:
-            while not condition(health := sensor.health()):
-                counted.append((health.duplicated, health.out_of_order, health.malformed))
-                time.sleep(0.005)
-
-        with sensor:
-            wait_for(lambda health: (health.duplicated, health.out_of_order, health.malformed) == (1, 1, 1))
-            counted.clear()
-            box.mute_and_then = [*map(record, [1, 2, 2, 3])]
-            wait_for(lambda health: health.reconnects > 0)
-            wait_for(lambda health: health.duplicated == 2)
-            sensor.latest(timeout_s=1.0)
-        after = sensor.health()
-        assert (after.duplicated, after.out_of_order, after.malformed) == (2, 1, 1)
-        assert set(counted) <= {(1, 1, 1), (2, 1, 1)}  # nothing is forgotten while there is no stream
-        sensor.open()
-        assert sensor.health().duplicated == 0
-        sensor.close()
 
 
 def test_a_device_that_does_not_answer() -> None:
@@ -226,21 +163,6 @@ def test_missing_library_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "ftdrivers.ati.netft")
     with pytest.raises(BadUrl, match=r"install it with `.*netft"):
         sensor_from_url("ati-netft://192.168.1.1")
-
-
-def test_text_in_a_page() -> None:
-    assert text_in(PAGE, "cfgcalsn") == "FT12345"
-    assert text_in(b"<cfgcalsn> FT 1 </cfgcalsn>", "cfgcalsn") == "FT 1"
-    for page in (b"", b"<cfgcalsn></cfgcalsn>", b"<cfgcalsn><b>x</b></cfgcalsn>", b"\xff" * 99):
-        assert not text_in(page, "cfgcalsn")
-
-
-def test_numbers_in_a_page() -> None:
-    assert numbers_in(b"<cfgmr>130;130;400.5;-10;0;1e1</cfgmr>", "cfgmr") == [130, 130, 400.5, -10, 0, 10]
-    for element in ("comrdtrate", "commrdtrate"):
-        assert numbers_in(f"<{element}>500</{element}>".encode(), "comm?rdtrate") == [500]
-    for text in (b"", b"empty", b"130;;130", b"nan", b"inf"):
-        assert numbers_in(b"<cfgmr>" + text + b"</cfgmr>", "cfgmr") == []
 
 
 def test_rate_range_and_bias_are_the_devices() -> None:
@@ -269,12 +191,6 @@ def test_rate_range_and_bias_are_the_devices() -> None:
         assert "range" not in facts
         assert facts["software_bias"] == Fact((0.0,) * 6, "device")
         assert math.isnan(sensor.health().nominal_rate_Hz)
-
-
-@pytest.mark.parametrize(("element", "firmware"), [(b"<mfgdigver>2.2.59</mfgdigver>", "2.2.59"), (b"", "not reported")])
-def test_firmware_is_read_where_the_page_has_it(element: bytes, firmware: str) -> None:
-    with Box(page=PAGE.replace(b"</netft>", element + b"</netft>")) as box, box.sensor() as sensor:
-        assert sensor.identify().firmware == firmware
 
 
 def test_tool_transformation_of_the_box_is_undone() -> None:
@@ -320,10 +236,3 @@ def test_tool_transformation_that_cannot_be_undone_is_refused(page: bytes) -> No
         pytest.raises(ConnectError, match=r"cannot be undone.*set it to zero"),
     ):
         box.sensor().open()
-
-
-def test_status_in_words() -> None:
-    assert describe_status(0, NET_FT_BITS, 32) == "0x00000000 (ok)"
-    assert describe_status(0x80020000, NET_FT_BITS, 32).startswith("0x80020000 (bit 17: transducer saturated")
-    assert "bit 30: force or torque out of range" in describe_status(0x40000000, AXIA_BITS, 32)
-    assert describe_status(0x10, ONROBOT_BITS, 32) == "0x00000010 (bit 4: overload Fx)"

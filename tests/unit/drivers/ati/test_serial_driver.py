@@ -1,8 +1,6 @@
 """The bytes of the ATI serial driver as a table: golden start-up and goodbye, awkward answers, and a damaged stream."""
 
-import math
 import struct
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import repeat
 from typing import Any
@@ -13,7 +11,6 @@ import pytest
 from ftdrivers.ati.serial import AtiSerialSensor
 from ftdrivers.clock import Clock
 from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, ProtocolError, StreamBroken
-from ftdrivers.interfaces import Fact
 from tests.unit.drivers.dialogue import Stream, Table
 from tests.unit.drivers.in_one_thread import InOneThread
 
@@ -142,62 +139,6 @@ def test_start_up_and_goodbye_are_golden(table: Table) -> None:
     assert len(samples) == pytest.approx(700, abs=35)
 
 
-def test_what_is_left_of_an_answer_is_not_the_next_one(table: Table) -> None:
-    with table.serial(start_up(status=FINE + b"\x0a\x03")) as wire, Sensor(wire.clock):
-        pass  # nothing had to be asked twice
-
-
-@pytest.mark.parametrize(
-    ("unit_codes", "max_rating", "counts_per_N", "range_"),
-    [
-        (b"\x02\x03", 25.0, 1e6, (25.0,) * 6),
-        (b"\x04\x04", 2.0, 1e3, (2000.0,) * 3 + (0.002,) * 3),  # kN and N·mm
-        (b"\x02\x03", 0.0, 1e6, None),
-        (b"\x02\x03", math.nan, 1e6, None),
-    ],
-)
-def test_scale_and_range_are_the_devices(
-    table: Table, unit_codes: bytes, max_rating: float, counts_per_N: float, range_: tuple[float, ...] | None
-) -> None:
-    with table.serial(start_up(calibration_block(unit_codes, max_rating))) as wire, Sensor(wire.clock) as sensor:
-        facts = sensor.identify().facts
-    assert facts["counts_per_N"] == Fact(counts_per_N, "device")
-    if range_ is None:
-        assert "range" not in facts
-    else:
-        assert facts["range"].source == "device"
-        assert facts["range"].value == pytest.approx(range_)
-
-
-def test_sensor_left_streaming_is_jammed_first(table: Table) -> None:
-    with table.serial(start_up(), Stream.of(BATCH)) as wire, Sensor(wire.clock) as sensor:
-        assert len(sensor.collect(0.05))
-
-
-def test_a_jam_is_believed_after_twenty_milliseconds_of_silence(table: Table) -> None:
-    with table.serial(start_up()) as wire:
-        start_s, at = wire.clock.now_s(), list[float]()
-        write = wire.write
-
-        def noting(data: bytes) -> None:
-            at.append(wire.clock.now_s() - start_s)
-            write(data)
-
-        wire.write = noting  # type: ignore[method-assign]
-        with Sensor(wire.clock):
-            pass
-    assert at[:2] == [0.0, pytest.approx(0.02, abs=1e-3)]
-
-
-def test_single_bad_records_are_dropped_and_counted(table: Table) -> None:
-    with table.serial(start_up()) as wire, Sensor(wire.clock) as sensor:
-        wire.once.append(RECORD_BAD + RECORD * 3 + RECORD_BAD)
-        samples = sensor.collect(0.05)
-        assert (sensor.health().malformed, sensor.health().lost) == (2, 2)
-    assert (samples.counts == COUNTS).all()
-    assert Counter(np.diff(samples.seq)) == {1: len(samples) - 3, 2: 2}
-
-
 def test_records_with_a_byte_of_wrong_parity_are_dropped_although_their_sum_holds(table: Table) -> None:
     turns = [(sent, marked(got) if isinstance(got, bytes) else got) for sent, got in start_up(stream=marked(BATCH))]
     with table.serial(turns, marks=True) as wire, Sensor(wire.clock) as sensor:
@@ -213,18 +154,6 @@ def test_records_with_a_byte_of_wrong_parity_are_dropped_although_their_sum_hold
 
 
 BATCH_MARKED = marked(BATCH)
-
-
-def test_slipped_stream_is_restarted(table: Table) -> None:
-    again = [(JAM, b""), (STATUS, FINE), started()]
-    with table.serial(start_up(None, FINE, *again)) as wire, Sensor(wire.clock) as sensor:
-        wire.clock.at(0.02, lambda: wire.once.append(b"\x77"))
-        samples, health = sensor.collect(0.12), sensor.health()
-    assert (samples.counts == COUNTS).all()
-    gaps = int((np.diff(samples.seq) - 1).sum())
-    assert 100 < gaps <= health.lost < 400  # some 30 ms at 7 kHz
-    assert samples.seq[-1] - samples.seq[0] == pytest.approx(0.115 * 7000, rel=0.1)
-    assert health.malformed >= 3
 
 
 def test_stream_that_never_makes_sense_ends(table: Table) -> None:
@@ -249,16 +178,6 @@ def test_error_bit_ends_the_stream_with_the_status_in_words(
         wire.once.append(RECORD_ERROR)
         with pytest.raises(error, match=says):
             sensor.collect(1.0)
-
-
-def test_error_bit_that_the_status_does_not_confirm_is_damage(table: Table) -> None:
-    again = [(JAM, b""), (STATUS, FINE), started()]
-    with table.serial(start_up(None, FINE, *again)) as wire, Sensor(wire.clock) as sensor:
-        wire.clock.at(0.02, lambda: wire.once.append(RECORD_ERROR))
-        samples, health = sensor.collect(0.12), sensor.health()
-    assert (samples.counts == COUNTS).all()
-    assert health.malformed == 1
-    assert (np.diff(samples.seq) - 1).sum() == health.lost > 100
 
 
 @pytest.mark.parametrize("status", [0x8000, 0xC000, 0x8100, 0x8001])
@@ -316,47 +235,9 @@ def test_critical_status_at_start_is_a_fault(table: Table) -> None:
         Sensor(wire.clock).open()
 
 
-def test_watchdog_bit_at_start_is_logged(table: Table, caplog: pytest.LogCaptureFixture) -> None:
-    with table.serial(start_up(None, bytes.fromhex("0A03020001DC45"))) as wire, Sensor(wire.clock) as sensor:
-        assert sensor.collect(0.05).status[0] == 1
-    assert "watchdog reset" in caplog.text
-
-
 def test_damaged_and_missing_replies_are_asked_again(table: Table) -> None:
     with table.serial(changed(start_up(), UNLOCK, b"", DONE[:-1] + b"\0", DONE)) as wire, Sensor(wire.clock):
         pass
-
-
-@pytest.mark.parametrize(("after_ms", "asked"), [(99.0, 1), (121.0, 2)])
-def test_a_reply_has_a_tenth_of_a_second(table: Table, after_ms: float, asked: int) -> None:
-    """And one read of 20 ms that looks for it."""
-    answers: list[Any] = [(after_ms, DONE), DONE][:asked]
-    with table.serial(changed(start_up(), UNLOCK, *answers)) as wire, Sensor(wire.clock):
-        pass
-
-
-def test_a_reply_that_this_computer_looks_at_late_is_a_reply(table: Table) -> None:
-    """One that comes in two pieces, of which the second is asked for only when the first is there."""
-    with table.serial(start_up()) as wire:
-        stall = wire.clock.stall
-        write = wire.write
-
-        def starved(data: bytes) -> None:
-            write(data)
-            wire.clock.advance(0.0011)
-            stall(2.0)
-
-        wire.write = starved  # type: ignore[method-assign]
-        sensor = Sensor(wire.clock)
-        sensor.open()
-        wire.write = write  # type: ignore[method-assign]
-        sensor.close()
-
-
-def test_lost_start_reply_is_recovered_by_a_jam(table: Table) -> None:
-    turns = [*changed(start_up(), START, b"")[:-1], (JAM, b""), started(), BYE]
-    with table.serial(turns) as wire, Sensor(wire.clock) as sensor:
-        assert len(sensor.collect(0.05))
 
 
 @pytest.mark.parametrize(
@@ -374,16 +255,3 @@ def test_refusals_end_the_start_up_at_once(table: Table, request_: bytes, reply:
     with wire, pytest.raises(ConnectError, match=rf"^ATI serial sensor on .*{message}") as caught:
         Sensor(wire.clock).open()
     assert "address" in caught.value.fix
-
-
-def test_a_missing_device_is_known_within_a_second(table: Table) -> None:
-    with table.serial([*[(JAM, b""), (STATUS, b"")] * 3, BYE]) as wire:
-        start_s = wire.clock.now_s()
-        with pytest.raises(ConnectError, match="no reply"):
-            Sensor(wire.clock).open()
-        assert wire.clock.now_s() - start_s < 0.5
-
-
-def test_port_that_is_not_there() -> None:
-    with pytest.raises(ConnectError, match="does not open"):
-        AtiSerialSensor("/dev/does-not-exist").open()

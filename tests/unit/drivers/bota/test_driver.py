@@ -76,50 +76,6 @@ def test_a_sensor_that_has_just_booted_is_not_asked_for_its_serial_number(table:
         assert sensor.identify().serial == "4711"
 
 
-def test_an_older_sensor_that_does_not_know_the_question_is_configured(table: Table) -> None:
-    run = b"R", Stream(frames(count(0, 10_000)), 0.01, b"r,0,R,0")
-    turns = [COMMANDS[0], (b"p?", b""), *COMMANDS[2:], run]
-    with table.serial(turns) as wire, Sensor(wire.clock, sinc=512) as sensor:
-        assert sensor.identify().serial == "not reported"
-
-
-def test_boot_text_names_the_sensor(table: Table) -> None:
-    wire = table.serial([])
-    wire.clock.at(1.0, lambda: wire.arrived.append(BOOT))
-    wire.clock.at(1.1, lambda: wire.stream(stream()))
-    with wire, Sensor(wire.clock) as sensor:
-        info = sensor.identify()
-    assert (info.model, info.serial, info.firmware) == ("Bota SensONE T15", "4711", "1.2.3")
-
-
-@pytest.mark.parametrize(("baud", "bauds"), [(None, [460_800, 230_400]), (115_200, [115_200])])
-def test_both_usual_baud_rates_are_tried_unless_one_is_given(
-    table: Table, baud: int | None, bauds: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """At the wrong one comes noise, at the right one a sensor that needs 3.5 s to boot."""
-    wire = table.serial([])
-    opened = list[int]()
-
-    def port(_: str, baud: int, **options: Any) -> Any:
-        wire.arrived.clear()
-        wire.streams += 1  # what was sent before has ended
-        opened.append(baud)
-        if baud == bauds[-1]:
-            wire.clock.at(3.5, lambda: wire.stream(stream()))
-        else:
-            wire.stream(Stream.of(b"\x80\x00\xf8" * 20, 0.01))
-        return wire(**options)
-
-    monkeypatch.setattr("serial.Serial", port)
-    begin_s = wire.clock.now_s()
-    with Sensor(wire.clock, baud=baud) as sensor:
-        assert len(sensor.collect(0.1))
-        assert wire.clock.now_s() - begin_s < 5
-        sensor.close()
-        sensor.open()
-    assert opened == [*bauds, bauds[-1]]  # the right one is tried first
-
-
 def test_a_sensor_at_neither_usual_baud_rate_is_refused(table: Table) -> None:
     silent = (
         r"no bytes arrived within 5.0 s at 460800 baud, no bytes.* at 230400 baud; check supply and wiring; .*sinc="
@@ -128,69 +84,12 @@ def test_a_sensor_at_neither_usual_baud_rate_is_refused(table: Table) -> None:
         Sensor(wire.clock).open()
 
 
-def test_a_reply_in_pieces_is_a_reply(table: Table) -> None:
-    run = b"R", Stream(frames(count(0, 10_000)), 0.01, b"r,0,R,0")
-    pieces = b"C", Stream([b"r", b",0,C", b",0"], 0.005)
-    with table.serial([pieces, *COMMANDS[1:], run]) as wire, Sensor(wire.clock, sinc=512):
-        assert wire.clock.now_s() < 1001
-
-
-def test_a_command_has_a_second_and_is_sent_five_times(table: Table) -> None:
-    run = b"R", Stream(frames(count(0, 10_000)), 0.01, b"r,0,R,0")
-    late = b"C", (990.0, b"r,0,C,0")
-    with table.serial([late, *COMMANDS[1:], run]) as wire, Sensor(wire.clock, sinc=512):
-        pass
-    wire = table.serial([(b"C", b"")] * 5)
-    start_s = wire.clock.now_s()
-    with wire, pytest.raises(ConnectError, match="'C' was not confirmed in 5 attempts of 1 s at 460800 baud;"):
-        Sensor(wire.clock, baud=460_800, sinc=512).open()
-    assert wire.clock.now_s() - start_s == pytest.approx(5.0, abs=0.3)
-
-
-@pytest.mark.parametrize(("boot_s", "opens"), [(4.8, True), (5.1, False)])
-def test_first_frames_are_waited_for_five_seconds(table: Table, boot_s: float, opens: bool) -> None:
-    wire = table.serial([])
-    wire.clock.at(boot_s, lambda: wire.stream(stream()))
-    sensor = Sensor(wire.clock, baud=460_800)
-    if opens:
-        sensor.open()
-        assert len(sensor.collect(0.1))
-        sensor.close()
-    else:
-        with pytest.raises(ConnectError, match=r"no bytes arrived within 5\.\d s at 460800 baud; check supply"):
-            sensor.open()
-
-
-def test_frames_that_waited_for_a_slow_computer_are_first_frames(table: Table) -> None:
-    wire = table.serial([], stream())
-    wire.clock.advance(0.2)
-    wire.clock.at(0.001, lambda: wire.clock.stall(5.0))
-    with Sensor(wire.clock) as sensor:
-        assert sensor.health().nominal_rate_Hz == pytest.approx(100)
-
-
 def test_clock_wraps(table: Table) -> None:
     with table.serial([], stream(2**32 - 150_000)) as wire, Sensor(wire.clock) as sensor:
         samples = sensor.collect(0.25)
     assert (np.diff(samples.seq) == 1).all()
     assert samples.t_device_s[-1] > 2**32 / 1e6
     np.testing.assert_allclose(np.diff(samples.t_device_s), 0.01, atol=1e-9)
-
-
-def test_gaps_are_seen_on_its_clock(table: Table) -> None:
-    times = [10_000 * k for k in range(1, 40) if k not in {25, 26, 30}]
-    with table.serial([], stream(*times)) as wire, Sensor(wire.clock) as sensor:
-        samples, health = sensor.collect(0.35), sensor.health()
-    assert sorted(np.diff(samples.seq))[-3:] == [1, 2, 3]
-    assert health.lost == 3
-
-
-def test_a_sample_that_comes_twice_is_one(table: Table) -> None:
-    times = [10_000 * k for k in range(1, 20)]
-    with table.serial([], stream(*times, times[-1])) as wire, Sensor(wire.clock) as sensor:
-        samples = sensor.collect(0.2)
-        assert sensor.health().duplicated == 1
-    assert (np.diff(samples.seq) == 1).all()
 
 
 def test_a_clock_that_goes_back_is_a_restart(table: Table) -> None:
@@ -211,13 +110,6 @@ def test_bytes_without_frames_are_of_another_baud_rate_or_device(table: Table) -
     assert found is not None
     assert float(found["s"]) == pytest.approx(wire.clock.now_s() - 1000, abs=0.1)
     assert "sinc=512" in str(caught.value)
-
-
-def test_bytes_without_frames_are_named_beside_a_command(table: Table) -> None:
-    wire = table.serial([(b"C", NOISE)] * 5)
-    with wire, pytest.raises(ConnectError, match="'C' was not confirmed .* at 115200 baud" + OTHER_BAUD) as caught:
-        Sensor(wire.clock, baud=115_200, sinc=512).open()
-    assert "sinc=512" not in str(caught.value)
 
 
 def test_frames_that_end_name_the_line(table: Table) -> None:

@@ -1,10 +1,8 @@
 """The Robotiq driver as a table of bytes: golden start-up and goodbye, and awkward answers."""
 
 import struct
-from collections.abc import Sequence
 from contextlib import nullcontext
 from itertools import count
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +18,6 @@ from tests.unit.drivers.in_one_thread import InOneThread
 FRAME = bytes.fromhex("20 4E D2 04 C9 FD 10 27 96 00 E7 FF E8 03 86 DC")
 START, STARTED = bytes.fromhex("09 10 01 9A 00 01 02 02 00 CD CA"), bytes.fromhex("09 10 01 9A 00 01 21 52")
 HALT = b"\xff" * 50, b""
-Turn = tuple[bytes, Any]
 
 
 def modbus(text: str) -> bytes:
@@ -49,15 +46,6 @@ def test_start_up_and_goodbye_are_golden(table: Table) -> None:
     assert len(samples) == pytest.approx(15, abs=1)
 
 
-def test_sensor_that_streams_since_it_booted_is_stopped_and_its_silence_waited_for(table: Table) -> None:
-    with table.serial([HALT, SERIAL, FIRMWARE, RUN, HALT], Stream.of(FRAME, 0.01)) as wire:
-        start_s = wire.clock.now_s()
-        wire.clock.advance(0.1)
-        with Sensor(wire.clock) as sensor:
-            assert len(sensor.collect(0.1)) > 3
-        assert wire.clock.now_s() - start_s > 0.1 + 0.05
-
-
 def test_sensor_without_a_firmware_register(table: Table) -> None:
     no_firmware = FIRMWARE[0], modbus("09 83 02")
     with table.serial([HALT, SERIAL, no_firmware, RUN, HALT]) as wire, Sensor(wire.clock) as sensor:
@@ -69,29 +57,6 @@ def test_sensor_that_refuses_to_stream(table: Table) -> None:
     wire = table.serial([HALT, SERIAL, FIRMWARE, refused, HALT])
     with wire, pytest.raises(ConnectError, match="function 0x10"):
         Sensor(wire.clock).open()
-
-
-@pytest.mark.parametrize(
-    "turns",
-    [
-        [(SERIAL[0], b""), HALT, SERIAL],
-        [(SERIAL[0], (190.0, SERIAL[1]))],
-        [(SERIAL[0], SERIAL[1][:-1] + b"?"), HALT, (SERIAL[0], b""), HALT, SERIAL],
-    ],
-    ids=["lost", "just in time", "damaged and lost"],
-)
-def test_a_question_has_a_fifth_of_a_second_and_is_asked_three_times(table: Table, turns: Sequence[Turn]) -> None:
-    with table.serial([HALT, *turns, FIRMWARE, RUN, HALT]) as wire, Sensor(wire.clock) as sensor:
-        assert sensor.identify().serial == "FTS-1234"
-
-
-def test_a_device_that_does_not_answer(table: Table) -> None:
-    ask = SERIAL[0], b""
-    wire = table.serial([HALT, ask, HALT, ask, HALT, ask, HALT])
-    start_s = wire.clock.now_s()
-    with wire, pytest.raises(ConnectError, match="no reply"):
-        Sensor(wire.clock).open()
-    assert wire.clock.now_s() - start_s == pytest.approx(3 * (0.05 + 0.2), abs=0.2)
 
 
 @pytest.mark.parametrize(("count", "is_end"), [(32767, True), (-32768, True), (32766, False), (-32767, False)])

@@ -4,27 +4,17 @@ import socket
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 
 from ftdrivers.clock import Clock
 from ftdrivers.errors import BadUrl, ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from ftdrivers.interfaces import Fact
 from ftdrivers.registry import sensor_from_url
-from ftdrivers.robotiq.sensor import Readings, RobotiqFt300, RobotiqUrcap
+from ftdrivers.robotiq.sensor import Readings, RobotiqUrcap
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.in_one_thread import InOneThread
 
 TEXT = b"( 1.500000 , -2.250000 , 30.000000 , 0.100000 , -0.050000 , 0.025000 )"
 VALUES = [1.5, -2.25, 30.0, 0.1, -0.05, 0.025]
-
-
-@pytest.mark.parametrize("size", [1, 7, 50, 71, 1000])
-def test_readings_arrive_in_any_pieces(size: int) -> None:
-    readings, text = Readings(), TEXT * 5
-    found = [one for at in range(0, len(text), size) for one in readings.feed(text[at : at + size])]
-    assert found == [(number, VALUES) for number in range(1, 6)]
-    assert readings.damaged == 0
 
 
 @pytest.mark.parametrize(
@@ -78,18 +68,6 @@ def wire(monkeypatch: pytest.MonkeyPatch) -> Socket:
     return wire
 
 
-def test_readings_are_samples(wire: Socket) -> None:
-    with Sensor(wire.clock) as sensor:
-        samples, info = sensor.collect(0.5), sensor.identify()
-        assert sensor.health().nominal_rate_Hz == 100
-    np.testing.assert_allclose(samples.wrench[:, 1:], [VALUES[1:]] * len(samples))
-    assert (np.diff(samples.seq) == 1).all()
-    assert samples.counts.shape == (len(samples), 0)
-    assert info.facts["range"] == Fact((300, 300, 300, 30, 30, 30), "documented")
-    assert "serial" not in info.facts
-    assert wire.closed
-
-
 def silence(wire: Socket) -> bytes:
     wire.clock.advance(wire.timeout_s)
     raise TimeoutError
@@ -119,28 +97,6 @@ def test_a_controller_without_the_urcap_is_named(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(socket, "create_connection", refuse)
     with pytest.raises(ConnectError, match=r"63351 does not answer.*URCap"):
         Sensor(FakeClock()).open()
-
-
-@pytest.mark.parametrize(
-    ("address", "host", "port"),
-    [
-        ("10.0.0.2", "10.0.0.2", 63351),
-        ("10.0.0.2:63351", "10.0.0.2", 63351),
-        ("10.0.0.2:1234", "10.0.0.2", 1234),
-        ("ur5e.local:1234?serial=FTS-1", "ur5e.local", 1234),
-        ("10.0.0.2?port=1234", "10.0.0.2", 1234),
-        ("10.0.0.2:1234?port=1234", "10.0.0.2", 1234),
-        ("[fe80::1]:63351", "fe80::1", 63351),
-    ],
-)
-def test_an_address_may_have_the_port_of_the_urcap(address: str, host: str, port: int) -> None:
-    sensor = sensor_from_url(f"robotiq-ft300://{address}")
-    assert isinstance(sensor, RobotiqUrcap)
-    assert sensor._address == (host, port)
-
-
-def test_an_address_with_a_path_is_a_serial_port() -> None:
-    assert isinstance(sensor_from_url("robotiq-ft300:///dev/ttyUSB0"), RobotiqFt300)
 
 
 @pytest.mark.parametrize(

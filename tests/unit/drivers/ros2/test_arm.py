@@ -96,13 +96,6 @@ def test_the_speed_is_that_of_the_faster_of_turn_and_translation_over_a_tenth_of
     assert speeds[0].shape == (6,)
 
 
-def test_the_speed_by_rare_poses_is_that_since_the_pose_before(graph: Graph) -> None:
-    arm = opened(graph)
-    for number, x_m in enumerate([0.0, 0.0, 0.1, 0.4], start=1):
-        graph.later(0.15, TOPIC, pose(5 + 0.15 * number, p=(x_m, 0, 1)))
-        assert arm.state().qd_rad_s[0] == pytest.approx([0, 0, 0.1 / 0.15, 0.3 / 0.15][number - 1])
-
-
 def test_silence_is_an_error_after_its_limit(graph: Graph) -> None:
     arm = opened(graph)
     graph.clock.advance(0.1)
@@ -143,16 +136,6 @@ def test_a_follower_reads_every_pose_in_order(graph: Graph) -> None:
     arm.open()
     with pytest.raises(StreamBroken, match="the arm was closed; follow it again"):
         follow.read(0.1)
-
-
-def test_one_of_two_followers_ends_alone(graph: Graph) -> None:
-    arm = opened(graph)
-    with arm.follow() as first:
-        with arm.follow():
-            pass
-        graph.later(0.01, TOPIC, pose(5.1))
-        assert len(first.read(0.1).t_host_ns) == 1
-    assert arm._followers == []
 
 
 @pytest.mark.parametrize(("back_s", "is_other"), [(0.0, False), (0.45, False), (0.52, True)])

@@ -12,12 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, solve
-from ftcalib.errors import AcceptanceError, DataError, FtdriveError
+from ftcalib.errors import AcceptanceError, DataError
 from ftdrive.checks.sensor import check_compensated
 from ftdrivers.errors import BadUrl, DeviceError, ProtocolError
 from ftdrivers.interfaces import FtSamples
-from ftdrivers.registry import sensor_from_url
-from ftdrivers.ros2.arm import Ros2Arm, pose_reader_of
+from ftdrivers.ros2.arm import Ros2Arm
 from ftdrivers.ros2.middleware import Received
 from ftdrivers.ros2.poses import Chain, Joints, Poses, Transforms
 from ftdrivers.ros2.sensor import Ros2Sensor
@@ -58,12 +57,6 @@ def test_a_chain_agrees_with_kinematics_written_apart(urdf: Path) -> None:
     expected_R, expected_p = flange(q)
     assert np.allclose(R, expected_R, atol=1e-12)
     assert np.allclose(p, expected_p, atol=1e-12)
-
-
-def test_a_urdf_is_not_read_without_end(urdf: Path) -> None:
-    urdf.write_text(URDF.replace("</robot>", " " * 16_000_000 + "</robot>"))
-    with pytest.raises(BadUrl, match=r"is not a URDF .*: give the file with xacro evaluated"):
-        Chain(urdf, "", "flange")
 
 
 def test_other_joints_on_the_topic_are_left_out(urdf: Path) -> None:
@@ -184,20 +177,6 @@ def test_an_address_that_cannot_be_used_is_one_sentence(words: str, host: str, u
     planar.write_text(URDF.replace('type="fixed"', 'type="planar"'))
     with pytest.raises(BadUrl, match=words):
         Ros2Arm(host.format(urdf=urdf, broken=broken, planar=planar))
-
-
-@pytest.mark.parametrize("url", ["ros2:", "ros2:/", "ros2:/ft?reliable=2", "ros2:/ft?rate=5", "ros2:/ft#x"])
-def test_an_address_of_a_sensor_that_cannot_be_used_is_one_sentence(url: str) -> None:
-    with pytest.raises(FtdriveError, match=r"names no device|reliable|unknown option rate"):
-        sensor_from_url(url)
-
-
-def test_addresses_of_topics() -> None:
-    sensor = sensor_from_url("ros2:/robot/ft?reliable=1&recover=1&range=300,30", sign=-1)
-    assert isinstance(sensor, Ros2Sensor)
-    assert (sensor.name, sensor.recover) == ("ROS 2 topic /robot/ft", True)
-    assert list(pose_reader_of("ros2:/arm/pose").topics) == ["/arm/pose"]
-    assert list(pose_reader_of("ros2:tf?base=b&flange=f").topics) == ["/tf", "/tf_static"]
 
 
 @pytest.mark.parametrize("bias_N", [0.0, 7.0])

@@ -1,19 +1,18 @@
 """The reader shared by all streaming sensors: nothing lost, nothing old, nothing silent, every limit to the tick."""
 
-import json
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftdrivers.clock import REAL, Clock, Waitable
+from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, Frozen, ProtocolError, StreamBroken
-from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, FtSamples
+from ftdrivers.interfaces import Array, DeviceInfo, Fact, FtSamples
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.in_one_thread import InOneThread
@@ -154,15 +153,6 @@ def failure_of(sensor: StreamingSensor) -> type[Exception] | None:
     return None
 
 
-def test_constructor_touches_nothing() -> None:
-    fake = FakeSensor()
-    assert fake.connects == 0
-    with pytest.raises(StreamBroken, match="not open"):
-        fake.check()
-    with pytest.raises(ConnectError, match="open it first"):
-        fake.identify()
-
-
 def test_collect_has_every_sample_of_the_window_and_no_other(sensor: FakeSensor) -> None:
     sensor.stream(3, 0.005)
     sensor.collect(0.012)
@@ -224,38 +214,11 @@ def test_a_gap_inside_a_collect_is_an_error_although_the_stream_came_back(sensor
     assert len(sensor.collect(0.3)) >= 1
 
 
-def test_a_gap_that_no_wait_noticed_is_found_in_the_stamps(sensor: FakeSensor) -> None:
-    """A consumer that was suspended sees the stream as it was, not as it is."""
-    sensor.stream(1, 0.01)
-    first = sensor.block([10**6])
-    late = sensor.block([10**6 + 1], after_s=0.35)
-
-    def skip() -> None:
-        sensor.feed.extend((first, late))
-        sensor.time.stall(0.35)
-
-    sensor.time.at(0.05, skip)
-    with pytest.raises(DeviceTimeout):
-        sensor.collect(0.3)
-
-
 def test_more_samples_than_a_collect_may_hold_is_an_error() -> None:
     with FakeSensor(most=10) as fake:
         fake.stream(3)
         with pytest.raises(StreamBroken, match=r"12 samples .* limit is 10; .* in shorter pieces"):
             fake.collect(1.0)
-
-
-def test_what_the_device_does_not_report_is_configured() -> None:
-    rating = Fact((100.0,) * 6, "device")
-    fake = FakeSensor(sign=-1)
-    fake.info = DeviceInfo("fake", NOT_REPORTED, "1.0", {"range": rating})
-    fake.configured = {"serial": Fact("F7", "configured")}
-    with fake:
-        info = fake.identify()
-    assert info.serial == "F7"
-    assert info.facts == {"serial": Fact("F7", "configured"), "range": rating, "sign": Fact(-1, "configured")}
-    assert json.loads(json.dumps(asdict(info)))["facts"]["range"] == {"value": [100.0] * 6, "source": "device"}
 
 
 def test_a_sensor_with_another_serial_number_is_refused() -> None:
@@ -279,37 +242,6 @@ def test_sign_turns_the_wrench_once_and_leaves_counts_raw() -> None:
         FakeSensor(sign=0)
 
 
-def test_open_after_a_failure_starts_clean(sensor: FakeSensor) -> None:
-    sensor.feed.append(StreamBroken("gone"))
-    sensor.settle()
-    assert failure_of(sensor) is StreamBroken
-    sensor.open()
-    sensor.check()
-    assert (sensor.connects, sensor.disconnects) == (2, 1)
-    assert sensor.health().received == 1
-
-
-def test_what_a_codec_says_gets_the_name_of_the_device() -> None:
-    fake = FakeSensor()
-    for said in ("odd", "fake: odd"):
-        fake.connect_error = ProtocolError(said)
-        with pytest.raises(ConnectError, match=r"^fake: odd$"):
-            fake.open()
-
-
-@pytest.mark.parametrize(
-    ("raised", "seen"),
-    [(ProtocolError("odd"), ConnectError), (DeviceFault("hot"), DeviceFault), (KeyError(1), KeyError)],
-)
-def test_a_failed_connect_frees_the_port(raised: Exception, seen: type[Exception]) -> None:
-    fake = Fed(REAL)
-    fake.connect_error = raised
-    with pytest.raises(seen):
-        fake.open()
-    assert fake.disconnects == 1
-    assert not readers()
-
-
 def test_a_device_that_connects_and_stays_silent_for_a_second_is_not_open() -> None:
     fake = FakeSensor()
     fake.first = 0
@@ -320,15 +252,6 @@ def test_a_device_that_connects_and_stays_silent_for_a_second_is_not_open() -> N
     assert fake.disconnects == 1
     fake.at(0.99, 1)
     fake.open()
-
-
-def test_health_counts_and_knows_the_rate(sensor: FakeSensor) -> None:
-    sensor.stream(2, 0.01)
-    sensor.collect(2.0)
-    health = sensor.health()
-    assert health.received == pytest.approx(1 + 400, abs=2)
-    assert health.rate_Hz == pytest.approx(200, abs=4)
-    assert health.age_s <= 0.01
 
 
 @pytest.mark.parametrize("duration_s", [0.0, -1.0, float("nan")])
@@ -356,29 +279,6 @@ class TestThread:
         assert fake.health().received == 1
         fake.close()
         assert not readers()
-
-    def test_two_threads_collect_the_same_samples(self) -> None:
-        class Shared(FakeClock):
-            """Moves in this thread only; others wait."""
-
-            def wait(self, waitable: Waitable, timeout_s: float) -> bool:
-                here = threading.current_thread() is threading.main_thread()
-                return super().wait(waitable, timeout_s) if here else waitable.wait(0.01)
-
-        collected: list[FtSamples] = []
-        with FakeSensor(clock=Shared()) as fake:
-            fake.stream()
-            threads = [threading.Thread(target=lambda: collected.append(fake.collect(0.1))) for _ in range(2)]
-            for thread in threads:
-                thread.start()
-            while fake.readers < 2:
-                time.sleep(0.001)
-            fake.time.advance(0.12)
-            for thread in threads:
-                thread.join()
-        one, other = collected
-        assert one.seq.tolist() == other.seq.tolist()
-        assert len(one) == pytest.approx(20, abs=1)
 
     @pytest.mark.parametrize("wait", ["collect", "latest"])
     def test_close_ends_a_wait_elsewhere_at_once(self, wait: str) -> None:
@@ -452,17 +352,6 @@ def test_a_frozen_sensor_is_a_fault_after_a_fifth_of_a_second(sensor: FakeSensor
     assert sensor.time.now_s() - start_s == pytest.approx(0.2, abs=1e-3)
 
 
-def test_few_identical_samples_or_a_short_while_are_not_frozen(sensor: FakeSensor) -> None:
-    sensor.feed.append(sensor.block(list(range(10, 1000)), wrench=3.0))  # many, in no time
-    sensor.settle()
-    sensor.feed.append(sensor.block([1000]))
-    for seq in range(1001, 1031):  # a long while, few
-        sensor.at(0.01 * (seq - 1000), sensor.block([seq], after_s=0.01 * (seq - 1000), wrench=3.0))
-    sensor.time.advance(0.31)
-    assert sensor.health().received == 1 + 990 + 1 + 30
-    sensor.check()
-
-
 @pytest.mark.parametrize(("nominal_Hz", "enough"), [(7000.0, 50), (200.0, 40), (100.0, 20), (10.0, 20), (np.nan, 50)])
 def test_how_many_identical_samples_are_enough_depends_on_the_rate(
     sensor: FakeSensor, nominal_Hz: float, enough: int
@@ -524,17 +413,6 @@ class TestAway:
         sensor.settle()
         assert (sensor.health().received, sensor.health().lost) == (6, 5)
 
-    def test_it_is_never_shorter_than_a_silence_may_be(self) -> None:
-        with FakeSensor(limits=StreamLimits(stale_s=0.45)) as sensor:
-            sensor.time.stall(0.4)
-            sensor.feed.append(5)
-            sensor.settle()
-            assert sensor.health().events == ()
-            sensor.time.stall(0.5)
-            sensor.feed.append(5)
-            sensor.settle()
-            assert sensor.health().lost == 5
-
     def test_the_backlog_is_thrown_away_until_a_read_has_to_wait(self, sensor: FakeSensor) -> None:
         sensor.time.stall(5.0)
         sensor.feed.extend([1, *[10] * 20])  # at once
@@ -543,17 +421,6 @@ class TestAway:
         health = sensor.health()
         assert health.lost == pytest.approx(1 + 200 + 5, abs=1)  # the first read to wait after 50 ms ends it
         assert health.received == sensor.seq - health.lost
-
-    def test_who_is_away_again_meanwhile_begins_again(self, sensor: FakeSensor) -> None:
-        sensor.time.stall(5.0)
-        sensor.feed.extend([1, 10])
-        sensor.stream(1, 0.01)
-        sensor.time.at(0.045, lambda: sensor.time.stall(5.0))  # once more before the 50 ms are over
-        sensor.time.advance(0.06)
-        assert sensor.health().received == 1
-        sensor.time.advance(0.1)
-        assert sensor.health().received > 1
-        assert sensor.health().lost >= 11 + 4 + 5
 
     def test_a_stream_that_never_has_to_be_waited_for_is_believed_after_half_a_second(self, sensor: FakeSensor) -> None:
         def send() -> None:
@@ -609,14 +476,6 @@ def test_samples_that_were_long_on_their_way_are_dropped_and_noted(sensor: FakeS
     assert "0.48 s late" in what
 
 
-def test_a_device_clock_that_is_a_hundredth_slow_is_not_late(sensor: FakeSensor) -> None:
-    for number in range(200):
-        sensor.feed.append(sensor.block([5 + number], after_s=float(number), t_device_s=10 + 0.99 * number))
-    sensor.settle()
-    assert sensor.health().received == 201
-    assert sensor.health().events == ()
-
-
 @pytest.mark.parametrize(
     ("clock", "says"),
     [
@@ -630,18 +489,6 @@ def test_a_jump_of_the_devices_clock_is_named(sensor: FakeSensor, clock: list[fl
         sensor.feed.append(sensor.block([5 + number], t_device_s=t_device_s))
     with pytest.raises(StreamBroken, match=says):
         sensor.collect(1.0)
-
-
-def test_a_late_block_or_a_slow_reader_is_no_jump() -> None:
-    with FakeSensor(limits=StreamLimits(stale_s=1.0)) as sensor:
-        sensor.feed.append(sensor.block([5], t_device_s=10.0))
-        sensor.settle()
-        sensor.time.stall(0.6)  # what came meanwhile waits in the port's buffer and is then read in pieces
-        for seq in range(6, 66):
-            sensor.feed.append(sensor.block([seq], t_device_s=10.0 + 0.01 * (seq - 5)))
-        sensor.settle()
-        assert sensor.health().received == 62
-        sensor.check()
 
 
 @pytest.mark.parametrize(("nominal_Hz", "hint"), [(1000.0, "lost"), (200.0, None), (100.0, "duplicated")])
@@ -658,26 +505,6 @@ def test_a_rate_off_by_more_than_a_tenth_is_said_once(
         assert hint in warned[0]
         assert health.events[0][1] == f"rate 200.0 Hz instead of {nominal_Hz:g} Hz"
     assert health.nominal_rate_Hz == nominal_Hz
-
-
-def test_a_rate_that_is_right_again_is_said_and_so_is_the_next_wrong_one(sensor: FakeSensor) -> None:
-    sensor.expect_rate(200.0)
-    t_s, seq = 0.0, 5
-    for rate_Hz in (100.0, 200.0, 100.0):
-        for _ in range(round(4.5 * rate_Hz)):
-            t_s, seq = t_s + 1 / rate_Hz, seq + 1
-            sensor.feed.append(sensor.block([seq], after_s=t_s))
-    sensor.settle()
-    assert ["again" in what for _, what in sensor.health().events] == [False, True, False]
-
-
-def test_silences_are_counted(sensor: FakeSensor) -> None:
-    for _ in range(2):
-        sensor.time.advance(0.32)
-        sensor.feed.append(1)
-        sensor.settle()
-    assert sensor.health().stale == 2
-    assert sensor.health().received == 3
 
 
 class TestRecover:
@@ -735,17 +562,6 @@ class TestRecover:
         assert caught.value.fix == "plug it in"
         assert sensor.health().reconnects == 0
 
-    def test_a_second_interruption_has_its_own_ten_seconds(self, sensor: FakeSensor) -> None:
-        def plug_in() -> None:
-            sensor.connect_error = None
-
-        for _ in range(2):
-            sensor.connect_error = ConnectError("not plugged in")
-            sensor.feed.append(StreamBroken("gone"))
-            sensor.time.at(8.0, plug_in)
-            sensor.time.advance(8.25)
-        assert sensor.health().reconnects == 2
-
     def test_a_collect_across_a_reconnection_too_quick_to_be_seen_is_an_error(self, sensor: FakeSensor) -> None:
         sensor.stream(1, 0.005)
 
@@ -767,14 +583,6 @@ class TestRecover:
         sensor.time.advance(0.35)
         assert connects == [1, 2]
         assert sensor.health().reconnects == 1
-
-    def test_what_was_lost_and_damaged_before_stays_counted(self, sensor: FakeSensor) -> None:
-        sensor.count(lost=3, malformed=2)
-        sensor.feed.append(StreamBroken("gone"))
-        sensor.settle()
-        assert sensor.health().reconnects == 1
-        sensor.count(lost=10, malformed=20)
-        assert (sensor.health().lost, sensor.health().malformed) == (13, 22)
 
     def test_a_fault_found_while_connecting_again_is_final(self, sensor: FakeSensor) -> None:
         sensor.connect_error = DeviceFault("hot")
@@ -810,17 +618,6 @@ class TestRecover:
         assert sensor.connects == 1
 
 
-@pytest.mark.parametrize("what", [lambda sensor: sensor.collect(0.1), lambda sensor: sensor.latest(timeout_s=0.1)])
-def test_a_consumer_that_comes_late_finds_what_came_in_time(
-    sensor: FakeSensor, what: Callable[[FakeSensor], FtSamples]
-) -> None:
-    """It looks at the data first, at the deadline second."""
-    sensor.stream(1, 0.01)
-    sensor.time.advance(0.05)
-    sensor.time.at(0.02, lambda: sensor.time.advance(0.2))  # the consumer itself gets no time, the reader does
-    assert len(what(sensor))
-
-
 class TestFollow:
     def test_every_sample_comes_once_and_in_order(self, sensor: FakeSensor) -> None:
         sensor.stream(3, 0.004)
@@ -833,48 +630,6 @@ class TestFollow:
         whole = FtSamples.concatenate(pieces)
         assert whole.seq.tolist() == list(range(1, len(whole) + 1))
         assert whole.wrench == pytest.approx(sensor.wrench(whole.seq))
-
-    def test_it_waits_for_the_first_sample_and_no_longer(self, sensor: FakeSensor) -> None:
-        sensor.at(0.05, 2)
-        with sensor.follow() as follow:
-            begin_s = sensor.time.now_s()
-            assert len(follow.read(0.02)) == 0
-            assert sensor.time.now_s() - begin_s == pytest.approx(0.02, abs=1e-3)
-            assert len(follow.read(0.1)) == 2
-            assert sensor.time.now_s() - begin_s == pytest.approx(0.05, abs=1e-3)
-            assert follow.read(0.0).counts.shape == (0, 6)
-
-    def test_followers_do_not_share_samples(self, sensor: FakeSensor) -> None:
-        sensor.stream(1, 0.01)
-        with sensor.follow() as one:
-            sensor.time.advance(0.1)
-            with sensor.follow() as other:
-                sensor.time.advance(0.1)
-                first, second = one.read(0.0).seq.tolist(), other.read(0.0).seq.tolist()
-            assert first[-len(second) :] == second
-            assert 0 < len(second) < len(first)
-        assert not sensor.readers
-
-    def test_a_lost_sample_is_a_gap_in_the_numbers(self, sensor: FakeSensor) -> None:
-        sensor.feed.extend([sensor.block([5, 6]), sensor.block([9])])
-        with sensor.follow() as follow:
-            sensor.settle()
-            assert follow.read(0.1).seq.tolist() == [5, 6, 9]
-
-    def test_what_came_before_silence_is_read_first(self, sensor: FakeSensor) -> None:
-        sensor.at(0.1, 4)
-        with sensor.follow() as follow:
-            sensor.time.advance(1.0)
-            assert len(follow.read(0.0)) == 4
-            with pytest.raises(DeviceTimeout, match=r"0\.9\d\d s"):
-                follow.read(0.0)
-
-    def test_silence_is_raised_after_three_tenths_of_a_second(self, sensor: FakeSensor) -> None:
-        with sensor.follow() as follow:
-            heard_s = sensor.latest(timeout_s=0.0).t_host_ns[0] / 1e9
-            with pytest.raises(DeviceTimeout):
-                follow.read(5.0)
-            assert sensor.time.now_s() - heard_s == pytest.approx(0.301, abs=1e-3)
 
     @pytest.mark.parametrize("error", [StreamBroken("gone"), DeviceFault("hot"), Frozen("frozen")])
     def test_a_failure_is_raised_after_what_came_before_it(self, sensor: FakeSensor, error: Exception) -> None:

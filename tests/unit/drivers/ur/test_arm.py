@@ -1,17 +1,14 @@
 """`UrArm` with a controller in memory and a fake clock: every limit of time, every way to stop."""
 
-import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import fields
 from itertools import pairwise
 from math import inf, nan, radians
 from typing import Any
 
 import pytest
 
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import Guard
 from ftdrivers.ur import arm as arm_module
 from ftdrivers.ur import opening
@@ -21,7 +18,6 @@ from ftdrivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import (
     HOST,
-    ControlInMemory,
     Controller,
     MakeArm,
     ServicesInMemory,
@@ -89,12 +85,6 @@ def test_absurd_speeds_and_accelerations_are_refused(speed: float, arm: UrArm, c
     assert "move" not in controller.did
 
 
-@pytest.mark.parametrize(("stop_deg_s2", "is_allowed"), [(59.5, False), (60, True), (300, True), (300.5, False)])
-def test_a_stop_has_a_usual_deceleration(stop_deg_s2: float, is_allowed: bool) -> None:
-    with nullcontext() if is_allowed else pytest.raises(ValueError, match=r"choose 1\.05 to 5\.23"):
-        UrArm(HOST, stop_rad_s2=radians(stop_deg_s2))
-
-
 def test_unknown_models_are_refused_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match=r"'kr6' .*UR5e"):
         UrArm(HOST, model="kr6")
@@ -110,11 +100,6 @@ def test_bad_targets_never_leave_the_house(arm: UrArm, controller: Controller, q
     with pytest.raises(ValueError, match=says):
         arm.within_safety_limits(q_rad)
     assert "move" not in controller.did
-
-
-@pytest.mark.parametrize(("path", "source"), [("auto", "assumed"), ("script", "configured")], indirect=["path"])
-def test_the_control_path_is_a_fact(arm: UrArm, source: str) -> None:
-    assert arm.identify().facts["control"].source == source
 
 
 @pytest.mark.parametrize(
@@ -146,21 +131,6 @@ def test_a_whole_turn_is_within_the_range_of_a_joint(arm: UrArm) -> None:
         arm.within_safety_limits([0, -1.5, 1.5, 0, 0, -radians(360.001)])
 
 
-def test_a_new_arm_opens_no_connection_and_closes() -> None:
-    arm = UrArm(HOST, model="ur5e", speed_rad_s=radians(60))
-    arm.stop()
-    arm.close()
-    arm.close()
-    with pytest.raises(ConnectError, match="not open"):
-        arm.identify()
-
-
-@pytest.mark.slow
-def test_importing_the_driver_does_not_load_ur_rtde() -> None:
-    code = "import sys, ftdrivers.ur.arm; sys.exit(any('rtde_' in n or n == 'dashboard_client' for n in sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
 @on_ur_rtde
 def test_without_ur_rtde_the_error_says_where_it_exists(make_arm: MakeArm, controller: Controller) -> None:
     controller.ur_rtde_is_installed = False
@@ -188,18 +158,7 @@ def test_auto_takes_ur_rtde_where_it_can(
     assert why in reason
 
 
-def test_an_unknown_control_path_is_refused() -> None:
-    with pytest.raises(ValueError, match="auto, ur-rtde, script"):
-        UrArm(HOST, control="urscript")  # type: ignore[arg-type]
-
-
 # ---------------------------------------------------------------------- opening
-
-
-def test_opening_twice_starts_one_program(arm: UrArm, controller: Controller) -> None:
-    arm.open(control=True)
-    arm.open()
-    assert controller.did == ["start our program"]
 
 
 def test_reading_starts_nothing(make_arm: MakeArm, controller: Controller) -> None:
@@ -271,16 +230,6 @@ def test_a_safety_stop_while_starting_is_the_reason(
     assert clock.now_s() - begin_s < 1.0
 
 
-def test_what_rtde_may_not_say_refuses_the_opening_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    def damaged(*_: object, **__: object) -> None:
-        raise ProtocolError("RTDE recipe cannot be read: 01", "is this an RTDE server?")
-
-    monkeypatch.setattr(arm_module, "Reader", damaged)
-    with pytest.raises(ConnectError, match="recipe cannot be read: 01") as error:
-        UrArm(HOST).open()
-    assert error.value.fix == "is this an RTDE server?"
-
-
 # ---------------------------------------------------------------------- moving
 
 
@@ -342,12 +291,6 @@ def test_still_is_three_tenths_of_a_second_without_a_break(
     assert 0.52 <= clock.now_s() - begin_s < 0.55
 
 
-def test_still_needs_no_goal_where_the_arm_was_sent_nowhere(arm: UrArm, clock: FakeClock) -> None:
-    begin_s = clock.now_s()
-    arm.wait_until_still(timeout_s=5, guard=no_guard)
-    assert 0.3 <= clock.now_s() - begin_s < 0.33
-
-
 # ---------------------------------------------------------------------- limits of a move
 
 
@@ -374,36 +317,6 @@ def test_a_silent_controller_is_found_in_a_fifth_of_a_second(
     ]
 
 
-def test_a_lost_connection_is_reported_at_once(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
-    provoke = After(clock, 0.3, setting(controller, failure=StreamBroken("closed")))
-    with pytest.raises(StreamBroken):
-        move(arm, controller, provoke)
-    assert provoke.ago_s() < 0.05
-    assert controller.did[-1] == "dashboard stop"
-    assert controller.dashboard_limits_s[-1] == 0.4
-
-
-@on_ur_rtde
-@pytest.mark.parametrize(("answers_in_s", "ours"), [(0.38, True), (0.42, False)])
-def test_a_question_to_our_program_has_four_tenths_of_a_second(
-    arm: UrArm, controller: Controller, clock: FakeClock, answers_in_s: float, ours: bool
-) -> None:
-    controller.control_delay_s = answers_in_s
-    begin_s = clock.now_s()
-    with nullcontext() if ours else pytest.raises(DeviceFault, match="another program"):
-        move(arm, controller)
-    assert ours or 0.4 <= clock.now_s() - begin_s < 0.43
-    assert controller.control.alive == ours
-
-
-def test_another_program_is_found_in_a_move(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
-    provoke = After(clock, 0.3, setting(controller, hanging={"tcp_offset"}))
-    with pytest.raises(DeviceFault, match="another program"):
-        move(arm, controller, provoke)
-    assert 0.4 < provoke.ago_s() < 0.1 + 0.4 + 0.05  # asked ten times a second
-    assert controller.did[-1] == "dashboard stop"  # it could also be ours that hangs
-
-
 def test_another_program_found_before_a_move_is_left_alone(arm: UrArm, controller: Controller) -> None:
     controller.hanging = {"tcp_offset"}
     with pytest.raises(DeviceFault, match="another program"):
@@ -427,21 +340,6 @@ def test_a_control_path_that_hangs_is_killed(
     assert controller.did[-1] == "dashboard stop"
 
 
-@on_ur_rtde
-def test_a_control_process_that_ends_is_reported_at_once(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
-    control = controller.control
-    assert isinstance(control, ControlInMemory)
-    provoke = After(clock, 0.3, control.die)
-    with pytest.raises(StreamBroken, match=r"control.* ended \(exit code -11\)"):
-        move(arm, controller, provoke)
-    assert provoke.ago_s() < 0.05
-    assert controller.did[-1] == "dashboard stop"
-    with pytest.raises(StreamBroken, match="open the arm again"):
-        move(arm, controller)
-    arm.open(control=True)
-    move(arm, controller)
-
-
 @pytest.mark.parametrize(("hangs_s", "stopped"), [(0.45, False), (0.55, True)])
 def test_a_move_that_the_parent_does_not_watch_is_stopped_after_half_a_second(
     arm: UrArm, controller: Controller, clock: FakeClock, hangs_s: float, stopped: bool
@@ -454,18 +352,6 @@ def test_a_move_that_the_parent_does_not_watch_is_stopped_after_half_a_second(
         move(arm, controller, provoke)
     assert controller.did[-1] == "stop softly"
     move(arm, controller)  # and it is still ours
-
-
-def test_a_safety_stop_is_the_reason_of_an_ended_program(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
-    def trip() -> None:
-        controller.program = 4
-        clock.at(0.04, setting(controller, safety_bits=0x404))  # reported some cycles later
-
-    provoke = After(clock, 0.3, trip)
-    with pytest.raises(DeviceFault, match="protective stop"):
-        move(arm, controller, provoke)
-    assert provoke.ago_s() < 0.1
-    assert controller.did[-1] == "dashboard stop"  # the rest cannot be resumed
 
 
 # ---------------------------------------------------------------------- stopping
@@ -586,25 +472,3 @@ def test_an_old_attempt_to_stop_does_not_end_the_next_move(
 
 
 # ---------------------------------------------------------------------- an emulated cell
-
-
-def test_an_emulated_cell_may_be_slow_and_not_silent(
-    make_arm: MakeArm, controller: Controller, clock: FakeClock
-) -> None:
-    arm = make_arm(UrTiming.emulated())
-    controller.starts_in_s = 20.0
-    controller.control_delay_s = 1.0
-    arm.open(control=True)
-    arm.move_to(away(controller), timeout_s=60, guard=no_guard)
-    controller.silent = True
-    begin_s = clock.now_s()
-    with pytest.raises(DeviceTimeout):
-        arm.state()
-    assert clock.now_s() - begin_s == pytest.approx(0.2, abs=1e-6)
-
-
-def test_what_samples_prove_is_the_same_in_an_emulated_cell() -> None:
-    emulated, by_samples = UrTiming.emulated(), {"stale_s", "status_s", "glance_s", "reason_s", "still_s"}
-    for field in fields(UrTiming):
-        strict, generous = getattr(STRICT, field.name), getattr(emulated, field.name)
-        assert strict == generous if field.name in by_samples else strict <= generous, field.name

@@ -13,11 +13,9 @@ from ftdrivers.interfaces import ArmStates
 from ftdrivers.ur.kinematics import MODELS, Kinematics, forward
 from ftdrivers.ur.reading import Reader
 from ftdrivers.ur.sample import Sample
-from ftdrivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
 from tests.own_kinematics import drawn, real
 from tests.unit.drivers.ur.controller_in_memory import (
-    CYCLE_S,
     Controller,
     ReaderInMemory,
     ServicesInMemory,
@@ -45,16 +43,6 @@ def never() -> list[float]:
 # ---------------------------------------------------------------------- new samples
 
 
-def test_a_look_is_the_next_sample(controller: Controller, reader: Reader, clock: FakeClock) -> None:
-    for _ in range(3):
-        asked_s = controller.t_s
-        assert reader.look().t_device_s == pytest.approx(asked_s + CYCLE_S)
-    sample = reader.look()
-    assert sample.t_host_ns == clock.now_ns()
-    assert sample.q_rad == tuple(controller.q_rad)
-    assert (sample.robot_mode, sample.safety_bits, sample.program_state) == (7, 1, 1)
-
-
 @pytest.mark.parametrize("paused_s", [0.15, 3.0, 3600.0])
 def test_what_has_piled_up_in_a_pause_is_not_now(
     controller: Controller, reader: Reader, clock: FakeClock, paused_s: float
@@ -70,72 +58,11 @@ def test_what_has_piled_up_in_a_pause_is_not_now(
     assert reader.status().safety_mode == "protective stop"
 
 
-def test_a_status_is_the_newest_sample_and_costs_no_wait(
-    controller: Controller, reader: Reader, clock: FakeClock
-) -> None:
-    reader.look()
-    begin_s = clock.now_s()
-    status = reader.status()
-    assert clock.now_s() == begin_s
-    assert (status.robot_mode, status.safety_mode, status.program, status.fault) == (
-        "running",
-        "normal",
-        "stopped",
-        None,
-    )
-    assert (status.speed_slider, status.speed_scaling) == (0.5, 1.0)
-    assert (status.payload_kg, status.p_flange_payload_m) == (1.5, (0.0, 0.0, 0.05))
-    assert status.tcp_offset == tuple(controller.tcp_offset)
-
-
-def test_a_status_is_at_most_fifty_milliseconds_old(controller: Controller, reader: Reader, clock: FakeClock) -> None:
-    reader.look()
-    controller.silent = True
-    clock.advance(0.049)
-    reader.status()
-    clock.advance(0.002)
-    assert wait_s(clock, reader.status, DeviceTimeout) == pytest.approx(STRICT.stale_s, abs=1e-6)
-
-
 @pytest.fixture
 def full_rate(controller: Controller) -> ReaderInMemory:
     """A reader of an e-Series arm."""
     controller.period_s = 0.002
     return ReaderInMemory(controller, "UR5e")
-
-
-def test_a_busy_computer_at_the_full_rate_finds_new_samples(
-    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
-) -> None:
-    """The reader gets a turn now and then, and finds samples without waiting for them."""
-    full_rate.look()
-    for pause_s in (0.02, 0.0005, 0.0005, 0.02, 0.09):
-        controller.held_back = True
-        clock.advance(pause_s)
-        controller.held_back = False
-        begin_s = clock.now_s()
-        full_rate.look()
-        assert clock.now_s() - begin_s < 0.0081
-
-
-@pytest.mark.parametrize("stalled_s", [0.06, 0.19, 5.0])
-def test_what_the_network_has_delayed_is_not_now(
-    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock, stalled_s: float
-) -> None:
-    """The reader waits for each sample, so only the controller's clock shows that it is old."""
-    clock.advance(0.7)
-    controller.stalled_until_s = clock.now_s() + stalled_s
-    late: list[float] = []
-    while clock.now_s() < controller.stalled_until_s + 0.3:
-        clock.advance(0.001)
-        t_s = full_rate.newest_t_s
-        late.append(controller.t_s - t_s)
-        try:
-            status = full_rate.status()
-        except DeviceTimeout:
-            continue
-        assert controller.t_s - status.t_device_s <= STRICT.status_s + STRICT.late_s + 0.008
-    assert max(late) > 0.04
 
 
 def test_a_clock_that_stood_still_is_trusted_again_after_a_second(
@@ -147,18 +74,6 @@ def test_a_clock_that_stood_still_is_trusted_again_after_a_second(
         full_rate.look()
     clock.advance(0.85)
     full_rate.look()
-
-
-@pytest.mark.parametrize("slower", [0.04, -0.05, -9.0])  # simulators; the emulated arm lives ten times faster
-def test_a_clock_of_another_speed_is_not_late(
-    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock, slower: float
-) -> None:
-    begin_s = clock.now_s()
-    for _ in range(250):
-        controller.stood_still_s = slower * (clock.now_s() - begin_s)
-        before_s = clock.now_s()
-        full_rate.look()
-        assert clock.now_s() - before_s == pytest.approx(0.008, abs=1e-6)
 
 
 # ---------------------------------------------------------------------- silence
@@ -174,43 +89,6 @@ def test_silence_is_found_after_a_fifth_of_a_second(controller: Controller, read
     controller.silent = False
     reader.look()
     assert not reader.silent
-
-
-def test_a_shorter_silence_is_none(controller: Controller, reader: Reader, clock: FakeClock) -> None:
-    reader.look()
-    controller.silent = True
-
-    def speak() -> None:
-        controller.silent = False
-
-    clock.at(0.18, speak)  # the sample after the silence came without being waited for, as far as anybody knows
-    reader.look()
-    assert not reader.silent
-
-
-def test_a_pause_of_our_own_is_not_the_controllers(controller: Controller, reader: Reader, clock: FakeClock) -> None:
-    reader.look()
-    controller.silent = True
-    clock.at(0.04, lambda: clock.stall(30.0))
-
-    def speak() -> None:
-        controller.silent = False
-
-    clock.at(0.08, speak)  # due in the pause, so it comes after it
-    reader.look()
-
-
-def test_a_computer_that_sleeps_all_the_time_finds_silence_too(
-    controller: Controller, reader: Reader, clock: FakeClock
-) -> None:
-    controller.silent = True
-
-    def sleep() -> None:
-        clock.stall(30.0)
-        clock.at(0.01, sleep)
-
-    sleep()
-    assert wait_s(clock, reader.look, DeviceTimeout) < 120
 
 
 @pytest.mark.parametrize(
@@ -238,15 +116,6 @@ def test_the_end_of_the_stream_is_raised_at_every_look(
 
 
 # ---------------------------------------------------------------------- the flange
-
-
-def test_the_flange_is_of_one_sample_whatever_tcp_is_set(controller: Controller, reader: Reader) -> None:
-    for k in range(5):
-        controller.tcp_offset = [0.01 * k, 0.0, 0.2, 0.05 * k, 0.0, 0.0]
-        state = reader.state(never)
-        nominal = forward(MODELS["UR5e"], controller.q_rad)
-        np.testing.assert_allclose(state.p_base_flange_m, nominal.p_m, atol=1e-12)
-        np.testing.assert_allclose(state.R_base_flange, nominal.R, atol=1e-12)
 
 
 def test_an_old_controller_is_asked_for_its_tcp_before_and_after(controller: Controller) -> None:
@@ -340,16 +209,6 @@ def test_an_arm_of_another_model_is_refused(controller: Controller, is_a: str, s
             reader.state(never)
 
 
-@pytest.mark.parametrize("sends", [None, MODELS["UR5e"]])
-def test_a_tcp_that_changes_is_named_after_the_arm_has_fitted(controller: Controller, sends: Kinematics | None) -> None:
-    controller.kinematics = sends
-    reader = ReaderInMemory(controller, "UR5e")
-    reader.state(never)
-    controller.flange = lambda q: forward(MODELS["UR5e"], q) @ pose_from_ur([0, 0, 0.03, 0, 0, 0])
-    with pytest.raises(DeviceFault, match="active TCP changes"):
-        reader.state(never)
-
-
 def test_a_moving_arm_may_be_a_control_cycle_behind(controller: Controller) -> None:
     reader = ReaderInMemory(controller, "UR5e")
     controller.qd_rad_s = [math.radians(20)] * 6
@@ -404,19 +263,6 @@ def test_a_follower_reads_every_sample_as_flange_poses(
     assert full_rate.n_followers == 0
 
 
-def test_a_follower_loses_nothing_while_it_is_not_read(
-    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
-) -> None:
-    with full_rate.follow() as follow:
-        controller.held_back = True
-        clock.advance(3.0)
-        controller.held_back = False
-        clock.advance(0.01)
-        t_device_s = follow.read(0.0).t_device_s
-        assert len(t_device_s) == pytest.approx(3.01 / 0.002, abs=2)
-        np.testing.assert_allclose(np.diff(t_device_s), 0.002, atol=1e-9)
-
-
 def test_a_follower_finds_silence_as_quickly_as_a_look(
     controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
 ) -> None:
@@ -451,40 +297,6 @@ def test_the_end_of_the_stream_is_raised_at_a_follower(
                 follow.read(0.1)
     with pytest.raises(StreamBroken, match="reset"), full_rate.follow():
         pytest.fail("a stream that has failed was followed")
-
-
-def test_a_follower_of_an_arm_that_was_closed_is_not_left_waiting(
-    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
-) -> None:
-    with full_rate.follow() as follow:
-        clock.advance(0.004)
-        full_rate.close()
-        controller.failure = OSError("Bad file descriptor")
-        full_rate.receive()
-        assert len(follow.read(1.0)) == 2
-        with pytest.raises(StreamBroken, match="was closed; open it again"):
-            follow.read(1.0)
-
-
-def test_poses_without_power_over_the_joints_are_not_read(
-    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
-) -> None:
-    with full_rate.follow() as follow:
-        clock.advance(0.004)
-        controller.robot_mode = 5  # idle: powered, brakes closed
-        clock.advance(0.006)
-        controller.robot_mode = 3
-        clock.advance(0.01)
-        assert len(follow.read(0.0)) == 5
-        with pytest.raises(DeviceFault, match="measure its joints"):
-            follow.read(0.1)
-
-
-def test_a_follower_refuses_another_arm(controller: Controller) -> None:
-    reader = ReaderInMemory(controller, "UR5e")
-    reader.info = replace(reader.info, model="UR10e")
-    with reader.follow() as follow, pytest.raises(DeviceFault, match="another model"):
-        follow.read(0.1)
 
 
 # ---------------------------------------------------------------------- who it is

@@ -12,11 +12,7 @@ from typing import Any
 
 import pytest
 
-from ftdrivers.clock import REAL
-from ftdrivers.errors import StreamBroken
 from ftdrivers.ur import control_child
-from ftdrivers.ur.control_process import ControlProcess
-from ftdrivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import Controller
 
@@ -65,38 +61,10 @@ def test_a_move_that_no_caller_watches_is_stopped(controller: Controller, gap_s:
     assert ("stop softly" in controller.did) == stopped
 
 
-def test_without_a_move_no_caller_has_to_ask(controller: Controller) -> None:
-    times = [(0.0, "move"), (0.1, "stop"), (100.0, "tcp_offset"), (101.0, "move"), (101.1, "progress")]
-    values = served(controller, times)
-    assert values[-1] == (False, False)
-    assert controller.did == ["move", "stop softly", "move"]
-    assert controller.stopped_at_rad_s2 == [2.5]
-
-
 def test_a_move_that_had_ended_before_anybody_could_ask_was_not_stopped(controller: Controller) -> None:
     controller.clock.at(0.3, lambda: setattr(controller, "goal_rad", None))
     assert served(controller, [(0.0, "move"), (60.0, "progress")]) == [True, (True, False)]
     assert controller.did == ["move"]
-
-
-def test_what_the_library_says_comes_with_a_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    child = tmp_path / "child.py"
-    child.write_text(
-        "import json, sys\n"
-        'print(json.dumps({"id": 0, "value": None}), flush=True)\n'
-        "for line in sys.stdin:\n"
-        '    said = f"the connection was lost after {sys.argv[3]}"\n'
-        '    print(json.dumps({"id": json.loads(line)["id"], "error": said}), flush=True)\n'
-    )
-    monkeypatch.setattr(control_child, "__file__", str(child))
-    control = ControlProcess("10.0.0.1", 2.5, clock=REAL, timing=UrTiming.emulated())
-    try:
-        control.wait_until_ready(lambda: None)
-        with pytest.raises(StreamBroken, match=r"was lost after 2\.5") as error:  # host, rate, deceleration, limits
-            control.call("progress")
-        assert error.value.fix
-    finally:
-        control.kill()
 
 
 LIBRARY = """
@@ -140,9 +108,3 @@ def test_a_library_that_hangs_does_not_keep_its_process(
             assert child.wait(60) == -signal.SIGALRM
         finally:
             child.kill()
-
-
-def test_the_limits_of_the_process_are_those_of_its_parent() -> None:
-    assert (STRICT.child_starting_s, STRICT.child_leaving_s, STRICT.unwatched_s) == (9.0, 3.0, UNWATCHED_S)
-    for timing in (STRICT, UrTiming.emulated()):
-        assert timing.starting_s < timing.child_starting_s  # the parent gives up first, and says why

@@ -65,11 +65,6 @@ def test_messages_are_read_as_documented(data: bytes, expected: list[Message], s
     assert found == expected
 
 
-def test_only_code_210_is_a_read_only_connection() -> None:
-    assert Code(210, 0, "").is_read_only
-    assert not Code(204, 3, "path sanity check failed").is_read_only
-
-
 @given(st.binary(max_size=200))
 def test_decoding_is_total(data: bytes) -> None:
     buffer = bytearray(data)

@@ -1,4 +1,3 @@
-import math
 import os
 import socket
 import struct
@@ -52,18 +51,6 @@ def test_answers_are_read_from_the_documented_bytes() -> None:
     recipe.check(data)
     columns = recipe.columns([data, data])
     assert [column.tolist() for column in columns] == [2 * [x] for x in (12.5, 3, 1, 2, 1, -7, 0, *range(6))]
-
-
-@given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=80)), max_size=6), st.integers(1, 40))
-def test_packages_survive_any_cut_of_the_stream(packages: list[tuple[int, bytes]], step: int) -> None:
-    stream = b"".join(rtde.encode(kind, payload) for kind, payload in packages)
-    buffer, found = bytearray(), []
-    for at in range(0, len(stream), step):
-        buffer += stream[at : at + step]
-        while (package := rtde.take_package(buffer)) is not None:
-            found.append(package)
-    assert found == packages
-    assert not buffer
 
 
 @given(st.binary(max_size=120))
@@ -173,42 +160,6 @@ def test_samples_come_whole_and_in_order() -> None:
         assert third["timestamp"] == 3.0
 
 
-def test_a_read_empties_the_socket() -> None:
-    with served() as server, closing(subscribe(server)) as stream:
-        server.send(sample(1.0))
-        stream.read(30.0)
-        many = b"".join(sample(2.0 + k) for k in range(3000))  # more than three calls of recv
-        server.send(many)
-        received: list[bytes] = []
-        while len(received) < 3000:
-            received += stream.read(30.0)
-        assert stream.decode(received)["timestamp"].tolist() == [2.0 + k for k in range(3000)]
-
-
-@pytest.mark.parametrize(("major", "rate_Hz"), [(3, 125.0), (5, 500.0)])
-def test_no_controller_is_asked_for_more_than_its_own_rate(major: int, rate_Hz: float) -> None:
-    asked: list[float] = []
-
-    def answer(request: bytes) -> bytes:
-        if request[2] == rtde.SETUP_OUTPUTS:
-            asked.append(struct.unpack_from(">d", request, 3)[0])
-            return rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + b"DOUBLE")
-        version = rtde.encode(rtde.GET_CONTROLLER_VERSION, struct.pack(">4I", major, 10, 0, 0))
-        return {"V": ANSWER_PROTOCOL, "v": version, "S": ANSWER_START}[chr(request[2])]
-
-    with closing(Server(answer)) as server:
-        stream = rtde.Subscription(server.host, {"timestamp": "DOUBLE"}, math.inf, timeout_s=30.0)
-        assert asked == [stream.rate_Hz] == [rate_Hz]
-        stream.close()
-
-
-def test_outputs_that_a_controller_does_not_know_are_left_out() -> None:
-    with served({"timestamp": "DOUBLE", "safety_mode": "INT32"}) as server, closing(subscribe(server)) as stream:
-        assert stream.missing == ["tcp_offset"]
-        server.send(rtde.encode(rtde.DATA, b"\x01" + struct.pack(">di", 7.0, 3)))
-        assert values(stream) == [{"timestamp": 7.0, "safety_mode": 3}]
-
-
 def test_a_lost_connection_is_raised() -> None:
     with served() as server, closing(subscribe(server)) as stream:
         server.send(sample(1.0))
@@ -217,14 +168,6 @@ def test_a_lost_connection_is_raised() -> None:
         for _ in range(2):
             with pytest.raises((StreamBroken, OSError)):
                 stream.read(30.0)
-
-
-def test_closing_wakes_a_reader() -> None:
-    with served() as server, closing(subscribe(server)) as stream:
-        assert server.started.wait(30)
-        threading.Timer(0.05, stream.close).start()
-        with pytest.raises((StreamBroken, OSError)):
-            stream.read(60.0)
 
 
 @pytest.mark.parametrize(
@@ -269,12 +212,6 @@ def test_the_greeting_has_one_time_out_in_all() -> None:
             rtde.Subscription(server.host, OUTPUTS, 125.0, timeout_s=2.0, clock=clock)
     finally:
         server.close()
-
-
-def test_a_device_that_does_not_answer() -> None:
-    with pytest.raises(Unreachable, match="cannot be reached") as error:
-        rtde.Subscription("127.83.7.2", OUTPUTS, 125.0, timeout_s=0.5)
-    assert "switched on" in error.value.fix
 
 
 @pytest.mark.parametrize(

@@ -9,15 +9,13 @@ from numpy.typing import NDArray
 
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.sweep import Sweep
-from ftdrivers.ur import script_control
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import ControlSetting
 from ftdrivers.ur.primary import Code, Failed, Note, Stopped
 from ftdrivers.ur.script_control import OUTPUTS, STOPS_ITSELF_S, program_text
-from ftdrivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, MakeArm, away, no_guard
-from tests.unit.drivers.ur.program_in_memory import COMMANDS, Script
+from tests.unit.drivers.ur.program_in_memory import Script
 
 
 @pytest.fixture
@@ -41,37 +39,7 @@ def test_the_program_is_complete(version: tuple[int, int]) -> None:
     assert text.isascii()
 
 
-def test_program_and_driver_agree_on_registers_and_commands() -> None:
-    text = program_text(1, (5, 15), 5.0)
-    assert {int(k) for k in re.findall(r"read_input_integer_register\((\d+)\)", text)} == {32, 33, 34, 35}
-    written = {int(k) for k in re.findall(r"write_output_integer_register\((\d+),", text)}
-    assert written == {32, 33, 34, 35}
-    numbers = {int(k) for k in re.findall(r"ft_number\((\d+)\)", text)}
-    assert numbers == set(range(10))
-    for command in (f"input_int_register_{k}" for k in range(32, 36)):
-        assert command in script_control.INPUTS
-    named = {int(number): name for name, number in re.findall(r"global ft_(\w+) = ([1-9])\n", text)}
-    assert len(named) == len(script_control.COMMANDS) == len(COMMANDS)
-    for name, number in script_control.COMMANDS.items():
-        stem = {"within_safety_limits": "limits", "quit": "end"}.get(name, name.removeprefix("set_").split("_")[0])
-        assert named[number] == stem
-
-
 # ---------------------------------------------------------------------- the heartbeat
-
-
-@pytest.mark.usefixtures("arm")
-def test_every_sample_is_answered_with_one_heartbeat(script: Script, clock: FakeClock) -> None:
-    beats: list[float] = []
-    for _ in range(20):
-        clock.advance(CYCLE_S)
-        beats.append(script.registers.inputs[0])
-    assert len(set(beats)) == 20
-    script.link.sent.clear()
-    script.registers.far.silent = True
-    before = script.registers.inputs[0]
-    clock.advance(0.1)
-    assert script.registers.inputs[0] == before
 
 
 @pytest.mark.usefixtures("arm")
@@ -165,13 +133,6 @@ def test_a_program_that_starts_after_it_was_given_up_does_not_move(
     assert not script.registers.running
 
 
-@pytest.mark.usefixtures("arm")
-def test_a_program_of_another_session_ends(script: Script, clock: FakeClock) -> None:
-    script.registers.token += 1
-    clock.advance(2 * CYCLE_S)
-    assert script.registers.outputs[1] == -3
-
-
 def test_an_old_command_is_not_carried_out(
     arm: UrArm, script: Script, controller: Controller, clock: FakeClock
 ) -> None:
@@ -182,22 +143,6 @@ def test_an_old_command_is_not_carried_out(
         controller.control.send_again((old, 1, (0.0,) * 5 + (1.5, 1.0, 3.0, 0.0, 0.0)))
         clock.advance(5 * CYCLE_S)
     assert controller.did == before
-
-
-def test_a_move_paused_by_a_protective_stop_does_not_go_on(
-    arm: UrArm, script: Script, controller: Controller, clock: FakeClock
-) -> None:
-    """The dashboard server is lost too, so the program stays, paused, until the operator plays it."""
-    controller.dashboard_answers = False
-    clock.at(0.3, lambda: setattr(controller, "safety_bits", 0x404))
-    with pytest.raises(DeviceFault, match="protective stop"):
-        arm.move_to(away(controller), timeout_s=5, guard=no_guard)
-    where = controller.q_rad[5]
-    assert script.registers.running
-    controller.safety_bits = 1
-    clock.advance(1.0)
-    assert not script.registers.running
-    assert controller.q_rad[5] == pytest.approx(where, abs=0.009)  # one cycle of the controller in memory
 
 
 # ---------------------------------------------------------------------- the start
@@ -235,16 +180,6 @@ def test_a_runtime_error_is_the_reason_of_an_ended_program(
         arm.move_to(away(controller), timeout_s=5, guard=no_guard)
 
 
-def test_the_error_of_another_program_is_not_ours(
-    arm: UrArm, script: Script, controller: Controller, clock: FakeClock
-) -> None:
-    script.messages += [Failed(3, 1, "syntax_error_on_line:3:"), Stopped("other")]
-    clock.advance(0.1)
-    clock.at(0.3, lambda: setattr(controller, "program", 1))
-    with pytest.raises(DeviceFault, match="ended by itself or was stopped from outside"):
-        arm.move_to(away(controller), timeout_s=5, guard=no_guard)
-
-
 # ---------------------------------------------------------------------- settings and questions
 
 
@@ -267,13 +202,6 @@ def sweep_of(arm: UrArm) -> Sweep:
     return Sweep(arm.state().q_rad.tolist(), [[0.2, 0.02]] * 3, [[0.6, 4.0]] * 3, [[0.0, 1.0]] * 3, 3.0, 1.0)
 
 
-def test_a_sweep_is_sent_wave_by_wave(arm: UrArm, script: Script, controller: Controller) -> None:
-    sweep = sweep_of(arm)
-    arm.sweep(sweep, guard=no_guard)
-    assert np.allclose(script.registers.waves, sweep.waves.reshape(-1, 3))
-    assert controller.swept == (*sweep.centre_rad, sweep.duration_s, sweep.ramp_s)
-
-
 def test_a_guard_stops_a_sweep(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
     begun_s = clock.now_s()
 
@@ -291,32 +219,3 @@ def test_a_sweep_from_elsewhere_is_rejected(arm: UrArm, controller: Controller) 
     sweep = replace(sweep_of(arm), centre_rad=away(controller))
     with pytest.raises(DeviceFault, match="rejected the sweep"):
         arm.sweep(sweep, guard=no_guard)
-
-
-@pytest.mark.parametrize("how", ["suspended", "cut"])
-def test_a_sweep_without_heartbeat_stops(
-    arm: UrArm, script: Script, controller: Controller, clock: FakeClock, how: str
-) -> None:
-    control, sweep = controller.control, sweep_of(arm)
-    for k, wave in enumerate(sweep.waves.reshape(-1, 3).tolist()):
-        control.call("wave", k, *wave)
-    control.call("sweep", list(sweep.centre_rad), sweep.duration_s, sweep.ramp_s)
-    clock.advance(0.3)
-    assert controller.goal_rad is not None
-    if how == "cut":
-        script.link.cut = True
-    else:
-        control.suspended = True
-    clock.advance(STOPS_ITSELF_S)
-    assert controller.goal_rad is None
-    assert script.registers.outputs[1] == -2
-
-
-@pytest.mark.usefixtures("arm")
-def test_a_silent_controller_is_lost_after_its_limit_and_not_before(controller: Controller, clock: FakeClock) -> None:
-    controller.silent = True
-    clock.advance(STRICT.stale_s - 3 * CYCLE_S)
-    assert controller.control.alive
-    clock.advance(3 * CYCLE_S)
-    assert not controller.control.alive
-    assert "the controller sent nothing for" in str(controller.control.end_reason())

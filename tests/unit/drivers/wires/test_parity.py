@@ -55,25 +55,12 @@ def test_whatever_is_marked_and_however_it_is_cut_comes_back(line: list[tuple[in
     assert undone(cut(received(sent, true), places)) == (true, [at for at, (_, damaged) in enumerate(line) if damaged])
 
 
-@given(st.lists(st.text("\x00\xff1", max_size=8).map(lambda text: text.encode("latin-1")), max_size=8))
-def test_marks_that_no_system_writes_are_undone_all_the_same(reads: list[bytes]) -> None:
-    true, damaged = undone(reads)
-    assert len(true) <= len(b"".join(reads))
-    assert damaged == sorted(set(damaged))
-    assert undone([b"".join(reads)]) == (true, damaged)
-    assert undone([*reads, b"11", b"\xff\xff1"])[0].endswith(b"1\xff1")  # back in step
-
-
 def test_a_cut_mark_is_forgotten_on_request() -> None:
     for beginning in (b"\xff", b"\xff\x00"):
         marks = Unmarker()
         assert marks.undo(b"1" + beginning) == (b"1", [])
         marks.forget()
         assert marks.undo(b"2") == (b"2", [])
-
-
-def test_an_ff_without_its_second_one_is_damage() -> None:
-    assert undone([b"a\xffb\xff\xff"]) == (b"a\xffb\xff", [1])
 
 
 def every_change(record: bytes) -> Iterable[bytes]:
@@ -96,9 +83,3 @@ def test_no_single_damaged_byte_makes_a_record_that_is_believed(record: bytes) -
     undamaged = undone([received(record, record)])
     records = modbus.decode_records(*undamaged)
     assert (records.intact & records.parity).all()
-
-
-def test_damage_spoils_its_own_record_only() -> None:
-    data = b"".join(RECORDS)
-    assert modbus.decode_records(data, [13, 25, 51, 52]).parity.tolist() == [True, False, True, False]
-    assert modbus.decode_records(data, [12, 26, 38]).parity.tolist() == [False, True, False, True]
