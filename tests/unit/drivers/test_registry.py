@@ -48,11 +48,6 @@ def arguments(url: str) -> dict[str, Any]:
             {"bitrate": 250_000, "base": 0x20, "slot": 0, "unit_codes": None, "counts_per_unit": None},
         ),
         (
-            "ati-can://can0?bitrate=500000&base=0x7F&slot=3",
-            "ATI CAN sensor 0x7F on socketcan can0",
-            {"bitrate": 500_000, "base": 0x7F, "slot": 3},
-        ),
-        (
             "ati-can:///dev/ttyACM0?interface=slcan&units=lbf,N-mm&counts=1000000,2000000",
             "ATI CAN sensor 0x20 on slcan /dev/ttyACM0",
             {"interface": "slcan", "unit_codes": (1, 4), "counts_per_unit": (1_000_000, 2_000_000)},
@@ -62,7 +57,6 @@ def arguments(url: str) -> dict[str, Any]:
             "ATI serial sensor on /dev/serial/by-id/usb-FTDI_My Box-if00",
             {"calibration": 2},
         ),
-        ("robotous-can://can0?rate=500", "Robotous sensor on socketcan can0", {"rate_Hz": 500}),
         (
             "robotous-serial:///dev/ttyUSB0?baud=921600&rate=1000",
             "Robotous sensor on /dev/ttyUSB0",
@@ -70,11 +64,6 @@ def arguments(url: str) -> dict[str, Any]:
         ),
         ("robotiq-ft300:///dev/ttyUSB0", "Robotiq FT 300 on /dev/ttyUSB0", {}),
         ("bota:///dev/ttyUSB0?sinc=512", "Bota sensor on /dev/ttyUSB0", {"baud": None, "sinc": 512}),
-        (
-            "ati-netft://192.168.1.1",
-            "ATI Ethernet sensor at 192.168.1.1",
-            {"onrobot": False, "rdt_port": 49152, "http_port": 80},
-        ),
         (
             "ati-netft://192.168.1.1?onrobot=1&rdt_port=65535&http_port=1",
             "OnRobot Ethernet sensor at 192.168.1.1",
@@ -119,51 +108,28 @@ def test_a_serial_sensor_has_the_bit_rate_and_parity_of_its_manual(
     ("url", "message"),
     [
         ("can0", "write it like ati-can://can0"),
-        ("kms40://dev", "unknown sensor 'kms40': install .* one of ati-can, robotous-can"),
         ("ati-cam://dev", "unknown sensor 'ati-cam': did you mean ati-can://?"),
         ("ati-can://", "names no device"),
-        ("ati-can:can0", "names no device"),
-        ("ati-can://can0#1", "names no device"),
         ("ati-can://[can0", "write it like"),
         (
             "ati-can://can0?bitrat=1",
             "bitrat; known: base, bitrate, counts, interface, range, recover, serial, slot, units",
         ),
-        (
-            "ati-can://can0?units=lbf",
-            "units are 'lbf'; give one of lbf N klbf",
-        ),
-        ("ati-can://can0?units=N,Nm", "units are 'N,Nm'"),
-        ("ati-can://can0?units=", "empty"),
+        ("ati-can://can0?units=lbf", "units are 'lbf'; give one of lbf N klbf"),
         ("ati-can://can0?counts=1000000", "'counts' is '1000000'; give two"),
-        ("ati-can://can0?counts=1e6,1e6", "two whole numbers"),
-        ("ati-can://can0?counts=0,1000000", "two whole numbers"),
         ("robotous-can://can0?ids=0xF0,0xF1", "ids are '0xF0,0xF1'; give three"),
-        ("robotous-can://can0?ids=0xF0,0xF1,0xF1", "give three"),
-        ("robotous-can://can0?ids=0xF0,0xF1,0x800", "give three"),
         ("ati-can://can0?bitrate=fast", "whole number"),
         ("ati-can://can0?base=0x80", "allowed are 0 to 127"),
-        ("ati-can://can0?base=", "empty"),
         ("ati-can://can0?base", "key=value"),
         ("ati-can://can0?base=1&base=2", "twice"),
-        ("ati-serial:///dev/x?calibration=0", "allowed are 1 to 16"),
         ("ati-netft://x?rdt_port=65536", "allowed are 1 to 65535"),
-        ("ati-netft://x?http_port=65536", "allowed are 1 to 65535"),
-        ("ati-netft://x?rdt_port=0", "allowed are 1 to 65535"),
-        ("ati-netft://x?http_port=0", "allowed are 1 to 65535"),
         ("robotous-can://can0?rate=123", "rate is 123 Hz; choose one of 10, 20"),
         ("robotous-serial:///dev/x?rate=1000", "choose at most 333 Hz"),
         ("robotous-serial:///dev/x?baud=60000", "baud is 60000; choose"),
-        ("robotiq-ft300:///dev/x?rate=1", "unknown option rate; known: range, recover, serial"),
-        ("bota:///dev/x?sinc=2049", "allowed are 0 to 2048"),
         ("bota:///dev/x?sinc=63", "choose 64 to 2048"),
         ("bota:///dev/x?baud=38400", "choose one of 9600"),
         ("bota:///dev/x?range=300", "such as 300,30 or"),
-        ("bota:///dev/x?range=300,-30", "such as 300,30 or"),
-        ("bota:///dev/x?range=a,b", "such as 300,30 or"),
         ("bota:///dev/x?serial=", "empty"),
-        ("ati-netft://192.168.1.1?onrobot=2", "allowed are 0 to 1"),
-        ("ati-serial:///dev/x?parity=E", "unknown option parity; known: calibration, range, recover, serial"),
     ],
 )
 def test_mistakes_are_named(url: str, message: str) -> None:
@@ -264,6 +230,7 @@ def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
         build_arm(CellConfig(RobotConfig("127.0.0.1", driver="acmee"), anything))
 
 
+@pytest.mark.slow
 def test_doctor_asks_the_arm_of_another_package_only_what_any_arm_knows(install: Install, tmp_path: Path) -> None:
     points = "[ftdrive.sensors]\nacme-usb = acme_arm:Sensor\n[ftdrive.arms]\nacme = acme_arm:Arm\n"
     install("acme_arm", points, ACME)
@@ -317,8 +284,6 @@ def test_two_packages_with_one_name_are_both_named(install: Install) -> None:
     [
         ("import no_such_library", "ModuleNotFoundError: No module named 'no_such_library'"),
         ("", "AttributeError: .*"),
-        ("def broken(:", "SyntaxError: .*"),
-        ("{}['board']", "KeyError: 'board'"),
     ],
 )
 def test_a_package_that_cannot_be_imported_is_named(install: Install, source: str, error: str) -> None:

@@ -45,11 +45,8 @@ END = {
 }
 
 WRONG_ENDS: tuple[dict[str, Any], ...] = (
-    {"identity": {}},
     {"identity": "bota"},
     {"mean_force_N": [1, 2]},
-    {"mean_force_N": ["1", "2", "3"]},
-    {"mean_torque_Nm": None},
     {"mean_torque_Nm": [1, 2, math.nan]},
 )
 
@@ -59,10 +56,7 @@ WRONG_ENDS: tuple[dict[str, Any], ...] = (
     [
         ("", "empty"),
         ('{"format": "ftdrive.transcript/2"}', "first line"),
-        ("[]", "first line"),
         ('{"format": "ftdrive.transcript/1"}', "url or duration_s is missing"),
-        ('{"format": "ftdrive.transcript/1", "url": "x"}', "url or duration_s is missing"),
-        ('{"format": "ftdrive.transcript/1", "duration_s": 1}', "url or duration_s is missing"),
         (OPENED.replace('"event": "open"', '"event": "note"'), "the driver opened no port"),
         ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}', "no port"),
         (
@@ -70,12 +64,11 @@ WRONG_ENDS: tuple[dict[str, Any], ...] = (
             "line 2",
         ),
         ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns"', "line 2"),
-        ("\x00\x01", "line 1"),
         ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns": 1e999, "event": "open"}', "line 2"),
         ("[" * 100_000, "line 1|line 0"),
         *(
             (OPENED.replace('"duration_s": 1', f'"duration_s": {duration_s}'), "line 1")
-            for duration_s in ("0", "-1", "NaN", "Infinity", "1" + "0" * 400)
+            for duration_s in ("0", "NaN", "1" + "0" * 400)
         ),
         ('{"format": "ftdrive.transcript/1", "url": "bota://[x", "duration_s": 1}', r"line 1: .*bota://\[x: Invalid"),
         (OPENED + f'{{"t_ns": 1{"0" * 400}, "dir": "rx", "hex": "00"}}', "line 3"),

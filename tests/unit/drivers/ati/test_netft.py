@@ -151,11 +151,8 @@ def test_a_fault_in_the_stream_is_named(status: int, says: str) -> None:
 def test_a_device_that_does_not_answer() -> None:
     with pytest.raises(ConnectError, match="configuration cannot be read"):
         NetFtSensor("127.0.0.1", http_port=1).open()
-    with pytest.raises(ConnectError, match="configuration cannot be read"):
-        NetFtSensor("no such host").open()
-    for nowhere in ("no such host", " "):
-        with pytest.raises(ConnectError, match="check"):
-            NetFtSensor(nowhere, onrobot=True).open()
+    with pytest.raises(ConnectError, match="check"):
+        NetFtSensor(" ", onrobot=True).open()
 
 
 def test_missing_library_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

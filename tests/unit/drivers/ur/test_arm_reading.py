@@ -136,13 +136,8 @@ def test_an_old_controller_is_asked_for_its_tcp_before_and_after(controller: Con
 @pytest.mark.parametrize(
     ("mode", "name", "fix"),
     [
-        (12, "automatic mode safeguard stop", "close the safeguard of automatic mode"),
         (13, "three-position enabling stop", "hold the enabling device"),
-        (14, "three-position enabling stop of the pendant", "hold the enabling device"),
         (15, "IMMI emergency stop", "moulding machine"),
-        (16, "IMMI safeguard stop", "moulding machine"),
-        (17, "PROFIsafe waiting for parameters", "start the safety PLC"),
-        (18, "PROFIsafe automatic mode safeguard stop", "safety PLC"),
         (19, "PROFIsafe safeguard stop", "safety PLC"),
         (20, "PROFIsafe emergency stop", "safety PLC"),
         (22, "safety API safeguard stop", "safety API"),
@@ -198,7 +193,7 @@ def test_a_real_arm_is_read_and_what_contradicts_its_kinematics_is_refused(
         reader.state(never)
 
 
-@pytest.mark.parametrize("is_a", ["UR3e", "UR5", "UR10e", "UR16e", "UR30"])
+@pytest.mark.parametrize("is_a", ["UR3e", "UR5"])
 @pytest.mark.parametrize("sends", [None, MODELS["UR5e"]])
 def test_an_arm_of_another_model_is_refused(controller: Controller, is_a: str, sends: Kinematics | None) -> None:
     controller.kinematics = sends
@@ -219,10 +214,8 @@ def test_a_moving_arm_may_be_a_control_cycle_behind(controller: Controller) -> N
         reader.state(never)
 
 
-@pytest.mark.parametrize(
-    "number", [pytest.param(one, marks=[pytest.mark.slow] if k % 5 else []) for k, one in enumerate(sorted(real()))]
-)
-def test_every_real_arm_is_nearest_to_its_own_model(controller: Controller, number: str) -> None:
+@pytest.mark.parametrize("number", sorted(real())[::5])
+def test_a_real_arm_is_nearest_to_its_own_model(controller: Controller, number: str) -> None:
     model, own = real()[number]
     controller.flange = lambda q: forward(own, q)
     for controller.kinematics in (own, None):

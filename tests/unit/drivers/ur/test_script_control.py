@@ -61,7 +61,7 @@ def script_control_sample(script: Script, t_s: float) -> dict[str, NDArray[np.fl
 
 @pytest.mark.usefixtures("arm")
 @pytest.mark.parametrize("how", ["suspended", "cut", "killed"])
-@pytest.mark.parametrize("delay_s", [0.3, 0.302, 0.305, 0.307])
+@pytest.mark.parametrize("delay_s", [0.3, 0.305])
 def test_an_arm_without_heartbeat_stops_within_three_tenths_of_a_second(
     script: Script, controller: Controller, clock: FakeClock, how: str, delay_s: float
 ) -> None:
