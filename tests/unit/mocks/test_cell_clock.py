@@ -2,9 +2,7 @@
 
 import mmap
 import os
-import signal
 import subprocess
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,10 +10,7 @@ from pathlib import Path
 import pytest
 
 from ftmocks.clock import (
-    DEBT_NS,
     LEAD_NS,
-    PAGE_VERSION,
-    PATIENCE_S,
     SLOTS,
     SUSPECT_S,
     CellClock,
@@ -88,13 +83,6 @@ def pass_in_steps(real: RealTime, clock: CellClock, duration_s: float, step_s: f
         clock.now_ns()
 
 
-def test_the_page_is_laid_out_as_documented(clock: CellClock) -> None:
-    with Path(clock.path).open("rb") as page:
-        content = memoryview(page.read()).cast("q").tolist()
-    assert content[:3] == [PAGE_VERSION, clock.now_ns(), SLOTS]
-    assert content[4:] == [0] * 2 * SLOTS
-
-
 def test_it_does_not_pass_the_slowest_follower_by_more_than_its_lead(real: RealTime, clock: CellClock) -> None:
     clients = [Client(clock, slot) for slot in (0, 3, SLOTS - 1)]
     begun_ns = real.ns
@@ -125,31 +113,6 @@ def test_a_thread_of_the_station_is_waited_for_until_it_follows(real: RealTime, 
     assert clock.now_ns() > begun_ns + S, "no follower is left"
 
 
-def test_a_short_hold_is_made_up_for_and_a_long_one_is_lost(real: RealTime, clock: CellClock) -> None:
-    client = Client(clock, 0)
-    for held_s, lost_s in ((0.1, 0.0), (3.0, 3.0 - 1e-9 * (LEAD_NS + DEBT_NS))):
-        behind_ns = real.ns - clock.now_ns()
-        real.pass_s(held_s)
-        clock.now_ns()
-        steps_ns = []
-        for _ in range(100):
-            before_ns = clock.now_ns()
-            client.follow()
-            steps_ns.append(clock.now_ns() - before_ns)
-        assert max(steps_ns) <= LEAD_NS
-        assert real.ns - clock.now_ns() - behind_ns == pytest.approx(lost_s * S)
-
-
-def test_it_never_goes_back(real: RealTime, clock: CellClock) -> None:
-    client = Client(clock, 0)
-    real.pass_s(0.5)
-    now_ns = clock.now_ns()
-    client._page[client._at + 1] = now_ns - S  # a slot that is behind, such as one that was claimed with an old reading
-    assert clock.now_ns() == now_ns
-    real.pass_s(0.5)
-    assert clock.now_ns() == now_ns
-
-
 def test_the_slots_of_dead_processes_are_released(
     real: RealTime, clock: CellClock, start_process: Callable[[], subprocess.Popen[bytes]]
 ) -> None:
@@ -162,53 +125,3 @@ def test_the_slots_of_dead_processes_are_released(
     begun_ns = clock.now_ns()
     real.pass_s(1.0)
     assert clock.now_ns() > begun_ns + 0.9 * S
-
-
-def test_a_living_process_that_stops_is_waited_for_with_patience(
-    real: RealTime, clock: CellClock, start_process: Callable[[], subprocess.Popen[bytes]]
-) -> None:
-    process = start_process()
-    process.send_signal(signal.SIGSTOP)
-    client = Client(clock, 0, process.pid)
-    held_ns = real.ns + LEAD_NS
-    pass_in_steps(real, clock, PATIENCE_S)
-    assert clock.now_ns() == held_ns
-    pass_in_steps(real, clock, 1.0)
-    assert clock.now_ns() > held_ns + 0.9 * S
-    assert client.pid == process.pid, "it keeps its slot"
-    client.follow()
-    held_ns = clock.now_ns() + LEAD_NS
-    pass_in_steps(real, clock, PATIENCE_S / 2)
-    assert clock.now_ns() <= held_ns, "it follows again, so it is waited for again"
-
-
-def test_threads_read_one_rising_time_and_publish_it() -> None:
-    clock = CellClock()
-    try:
-        client = Client(clock, 0)
-        client.leave()
-        wrong: list[str] = []
-
-        def read(follow: bool) -> None:
-            step: Callable[[], int] = clock.follow if follow else clock.now_ns
-            before_ns = client.published_ns
-            for _ in range(3000):
-                now_ns = step()
-                published_ns = client.published_ns
-                if not before_ns <= now_ns <= published_ns:
-                    wrong.append(f"{before_ns} {now_ns} {published_ns}")
-                before_ns = published_ns
-
-        def keep_up() -> None:
-            with clock.keeping_up():
-                read(follow=True)
-
-        threads = [threading.Thread(target=keep_up) for _ in range(3)]
-        threads += [threading.Thread(target=read, args=(False,)) for _ in range(3)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert wrong == []
-    finally:
-        clock.close()

@@ -42,28 +42,6 @@ def test_arms_spread_as_real_ones_do() -> None:
     assert (medians.min(axis=0) < [0.2, 0.9]).all()
 
 
-def test_nearly_parallel_axes_have_offsets_of_metres_that_cancel() -> None:
-    dh = drawn("UR5e", 0)
-    assert min(map(abs, dh.d[1:4])) > 1.0
-    assert sum(dh.d[1:4]) == pytest.approx(MODELS["UR5e"].d[3], abs=5e-3)
-    assert dh == drawn("UR5e", 0) != drawn("UR5e", 1)
-
-
-def test_inverse_kinematics_finds_the_postures_of_a_drawn_arm() -> None:
-    dh, rng = drawn("UR10e", 4), np.random.default_rng(2)
-    for _ in range(20):
-        q = np.radians([45, -100, 60, -50, 90, 45]) + rng.uniform(-0.5, 0.5, 6)
-        solution = inverse(dh, forward(dh, q.tolist()), (q + rng.uniform(-0.05, 0.05, 6)).tolist())
-        assert solution == pytest.approx(q, abs=1e-8)
-
-
-@a_real_arm
-def test_parameters_of_a_real_arm_are_exact(arm: RealArm, tmp_path: Path) -> None:
-    dh = read(arm.save(tmp_path))
-    for q in np.random.default_rng(0).uniform(-math.pi, math.pi, (50, 6)):
-        np.testing.assert_allclose(forward(dh, q.tolist()), arm.flange(q), atol=1e-9)
-
-
 @a_real_arm
 def test_an_emulated_arm_has_the_kinematics_of_a_real_one(arm: RealArm, tmp_path: Path) -> None:
     path = arm.save(tmp_path)

@@ -84,7 +84,7 @@ def test_an_impossible_load_is_refused(wrong: dict[str, object], why: str) -> No
     assert world.hung is None
 
 
-@pytest.mark.parametrize(("string_m", "cycle_s"), [(0.15, CYCLE_S), (0.6, CYCLE_S), (0.25, 20 * CYCLE_S)])
+@pytest.mark.parametrize(("string_m", "cycle_s"), [(0.15, CYCLE_S), (0.25, 20 * CYCLE_S)])
 def test_the_period_is_that_of_a_pendulum_and_its_swing_decays(string_m: float, cycle_s: float) -> None:
     """Half a percent of damping leaves exp(-2 pi 0.005) of the swing in each period."""
     one, period_s = load(string_m, 1.0), 2 * math.pi * math.sqrt(string_m / 9.81)
@@ -108,16 +108,6 @@ def follow(one: HungLoad, at: Callable[[float], Array], seconds: float, cycle_s:
         one.follow(cycle_s, at(t), (at(t + 1e-5) - at(t - 1e-5)) / 2e-5)
         pulls.append(one.force_base_N)
     return pulls
-
-
-@pytest.mark.parametrize("cycle_s", [CYCLE_S, 20 * CYCLE_S])
-def test_a_load_feels_that_its_hook_accelerates(cycle_s: float) -> None:
-    """As in a lift and in a bus: it pulls with m (g - a), and swings about that direction."""
-    up = follow(load(), lambda t: np.array([0, 0, t * t]), 1.0, cycle_s)
-    np.testing.assert_allclose(up[-5:], [[0, 0, -2 * 11.81]] * 5, rtol=1e-3)
-    pulls = follow(load(), lambda t: np.array([0.25 * t * t, 0, 0]), 2.0, cycle_s)
-    largest = max(math.atan2(-pull[0], -pull[2]) for pull in pulls)
-    assert largest == pytest.approx(2 * math.atan(0.5 / 9.81), rel=0.04)
 
 
 def ran(robot: Robot, path: JointMove | LineMove) -> tuple[float, float]:

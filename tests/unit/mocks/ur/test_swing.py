@@ -14,9 +14,7 @@ HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 STEP_S = 0.004
 
 
-@pytest.mark.parametrize(
-    ("model", "limits"), [("UR3e", (1.0, 2.0, 2.0)), ("UR5e", (0.5, 1.5, 0.7)), ("UR20", (1.5, 4.0, 3.0))]
-)
+@pytest.mark.parametrize(("model", "limits"), [("UR3e", (1.0, 2.0, 2.0)), ("UR20", (1.5, 4.0, 3.0))])
 def test_the_flange_reaches_the_speed_and_the_accelerations_of_the_request(
     model: str, limits: tuple[float, float, float]
 ) -> None:
@@ -51,7 +49,6 @@ def test_a_swing_starts_and_ends_at_rest_where_it_began_after_whole_periods() ->
         ({"speed_rad_s": 0.0}, "positive"),
         ({"acceleration_m_s2": math.nan}, "positive"),
         ({"seconds": -1.0}, "positive"),
-        ({"speed_rad_s": 30.0, "acceleration_rad_s2": 100.0}, "joints|no swing"),
     ],
 )
 def test_an_impossible_swing_is_refused(changes: dict[str, float], why: str) -> None:

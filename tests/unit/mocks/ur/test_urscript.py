@@ -11,7 +11,7 @@ from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.ur.urscript.library import functions
 from ftmocks.ur.urscript.parser import parse
 from ftmocks.ur.urscript.syntax import NotEmulated, UrscriptSyntaxError
-from tests.unit.mocks.ur.urscript_robot import HOME, end_of, failure, logged, new_robot, results, run, start
+from tests.unit.mocks.ur.urscript_robot import HOME, failure, new_robot, results, run, start
 
 BUILT_IN = functions((5, 15, 0))
 
@@ -21,28 +21,18 @@ BUILT_IN = functions((5, 15, 0))
     [
         ("1 + 2 * 3 - 4 / 8", "6.5"),
         ("(1 + 2) * (-3)", "-9"),
-        ("7 % 3", "1"),
         ("-7.5 % 2", "-1.5"),
-        ("1 + 1 == 2", "True"),
-        ("3 >= 3.5", "False"),
         ('"a" != "b"', "True"),
         ("1 != True", "True"),
         ("not 1 == 2 and 3 >= 3", "True"),
         ("True xor True or False", "False"),
         ("False and undefined_yet", "False"),
-        ("[1, 2.5][1]", "2.5"),
         ("[p[0, 0, 3, 0, 0, 0], p[0, 0, 1, 0, 0, 0]][1][2]", "1"),
-        ("p[0, 0, 1, 0, 0, 0][2]", "1"),
         ("p[0, 0, 1, 0, 0, 0]", "p[0, 0, 1, 0, 0, 0]"),
         ("norm([3,\n  4  # in the next line\n])", "5.0"),
-        ("1 +\n  2 *\n 3", "7"),
-        ("norm(-2)", "2.0"),
         ("9.03E-5 * .5", "4.515e-05"),
-        ("1 + -2", "-1"),
         ("floor(-1.5)", "-2"),
         ("get_actual_joint_positions()", str(list(HOME))),
-        ("get_target_joint_positions()", str(list(HOME))),
-        ("get_target_joint_speeds()", str([0.0] * 6)),
         ("get_tcp_offset()", "p[0.0, 0.0, 0.0, 0.0, 0.0, 0.0]"),
         ("get_steptime()", "0.002"),
         ("is_within_safety_limits([0, 0, 0, 0, 0, 7])", "False"),
@@ -76,13 +66,6 @@ list[1] = odd
     assert results("list", "copy", before=before) == ["[0, 25]", "[0, 0]"]
 
 
-def test_halt_ends_the_program_inside_any_block_of_any_thread() -> None:
-    body = '  while True:\n    if 1 < 2:\n      halt\n    end\n  end\n  textmsg("after")\n'
-    for text in (f"def f():\n{body}end\n", f"def f():\n  thread t():\n  {body}\n  end\n  run t()\n  sleep(9)\nend\n"):
-        robot = start(text)
-        assert (end_of(robot).why, logged(robot)) == ("ended", [])
-
-
 @pytest.mark.parametrize(
     ("body", "place", "why"),
     [
@@ -91,22 +74,14 @@ def test_halt_ends_the_program_inside_any_block_of_any_thread() -> None:
         ("  while True:\n  end", (2, 3), "a loop needs sync"),
         ("  movej([0, 0, 0])", (2, 3), "movej: q must be a list of 6 numbers, not [0, 0, 0]"),
         ("  movej([0, 0, 0, 0, 0, 0], speed=1)", (2, 3), "movej: got an unexpected keyword argument 'speed'"),
-        ("  movej([0, 0, 0, 0, 0, 0], v=0)", (2, 3), "must be positive"),
         ("  if 1:\n  end", (2, 3), "a condition must be True or False, not 1"),
         ("  x = 1 / 0", (2, 3), "division by zero"),
         ('  x = "a" + 1', (2, 3), "a + 1 is not possible"),
-        ("  x = [1] + [2]", (2, 3), "[1] + [2] is not possible"),
-        ("  x = [1][1]", (2, 3), "[1] has no element 1"),
         ("  x = 1 + norm([1, True])", (2, 11), "norm: a must be a number, not True"),
-        ("  x = sleep(0)", (2, 7), "x = a function without a value"),
-        ("  kill 3", (2, 3), "kill needs another thread, not 3"),
         ("  break", (2, 3), "break outside of a loop"),
-        ("  write_output_integer_register(24, 1.5)", (2, 3), "must be a whole number"),
         ("  write_output_integer_register(48, 1)", (2, 3), "must be a whole number from 0 to 47, not 48"),
         ("  thread t():\n  end\n  t()", (4, 3), "t is a thread: write run"),
-        ("  def g(a):\n  end\n  g()", (4, 3), "g: the argument a is missing"),
         ("  def g():\n    g()\n  end\n  g()", (3, 5), "functions call each other"),
-        ("  x = 1" + " + 1" * 950, (2, 3), "functions call each other"),
     ],
 )
 def test_run_time_errors_say_what_is_wrong_and_where(body: str, place: tuple[int, int], why: str) -> None:
@@ -120,19 +95,12 @@ def test_run_time_errors_say_what_is_wrong_and_where(body: str, place: tuple[int
     ("text", "place", "why"),
     [
         ("def f():\n  x = \nend\n", (3, 1), "a name expected, found 'end'"),
-        ("def f():\n  if x\n  end\nend\n", (3, 3), "':' expected"),
         ("def f():\n  while True:\n  sleep(1)\nend\n", (5, 1), "'end' expected"),
         ("def f():\n  x = 1 ! 2\nend\n", (2, 9), "'! 2' is not URScript"),
-        ("def f():\n  1 + 2\nend\n", (3, 1), "an assignment or a call expected"),
         ("def f(x):\nend\n", (1, 1), "a program has no parameters"),
         ("def f():\n  sleep(a=1, 2)\nend\n", (2, 14), "a named argument expected after"),
-        ("def f():\n  end = 1\nend\n", (2, 7), "the end of the line expected"),
         ("def f():\nend\nx = 1\n", (3, 1), "nothing more expected"),
-        ("def f():\n  x = 'single'\nend\n", (2, 7), "is not URScript"),
-        ("def f():\n  x = (1, 2)\nend\n", (2, 9), "'\\)' expected"),
         ("def f():\n  x = 1 < 2 < 3\nend\n", (2, 13), "one comparison expected"),
-        ("def f():\n  x = None\nend\n", (2, 7), "a name expected"),
-        ("def f():\n  3 = x\nend\n", (2, 7), "only a variable"),
         ("(" * 3000, (1, 1), "nested too deeply"),
     ],
 )
@@ -150,7 +118,6 @@ def test_what_is_no_program_is_rejected_with_its_place(text: str, place: tuple[i
         ("def silly()\nend\n", (2, 1), "syntax_error_on_line:2:end:"),
         ('def silly():\n txtmsg("")\nend\n', (2, 2), "compile_error_name_not_found:txtmsg:"),
         ('def f():\n  textmsg("log ", get_tcp_offset()\nend\n', (3, 1), "syntax_error_on_line:3:end:"),
-        ("def f():\n  x = abs(-1)\nend\n", (2, 7), "compile_error_name_not_found:abs:"),
         ("def illegal_fun():\n  calldoesntexist()\nend", (2, 3), "compile_error_name_not_found:calldoesntexist:"),
     ],
 )
@@ -164,7 +131,6 @@ def test_errors_read_as_on_a_controller(text: str, place: tuple[int, int], repor
     ("text", "place", "what"),
     [
         ("def f():\n  x = 2 ^ 3\nend\n", (2, 9), "'^'"),
-        ("def f():\n  x = a.b\nend\n", (2, 8), "'.'"),
         ("def f():\n  x = [[1, 2], [3, 4]]\nend\n", (2, 7), "a list of lists (a matrix)"),
         ("def f():\n  switch x:\nend\n", (2, 3), "'switch'"),
     ],
@@ -179,7 +145,6 @@ def test_what_is_urscript_is_not_called_an_error(text: str, place: tuple[int, in
     ("body", "why"),
     [
         ("  h = 0\n  thread t():\n    sync()\n  end\n  h = run t()", "h changes its type from int to Thread"),
-        ("  x = 1.5\n  if True:\n    x = [1]\n  end", "x changes its type from float to list"),
         ("  x = True\n  def g():\n    x = 1\n  end", "x changes its type from bool to int"),
         ("  def g(a):\n    if a:\n      return 1\n    end\n    return 1.5\n  end", "g returns float and int"),
         ("  def g(a):\n    if a:\n      return\n    end\n    return True\n  end", "g returns bool and nothing"),
@@ -215,9 +180,7 @@ def test_a_type_that_changes_while_the_program_runs_ends_it(body: str, why: str)
         (f"def {'n' * 32}():\nend\n", "has more than 31 characters"),
         ("def f():\n  if True:\n    global x = 1\n  end\nend\n", "line 3: 'global' inside an if or while"),
         ("def f():\n  x = 1 + -2\nend\n", "line 2: a sign after '+'"),
-        ("def f():\n  x = -2 * -1\nend\n", "line 2: a sign after '*'"),
         ("def f():\n  x = 9.03E-5\nend\n", "line 2: 9.03E-5 has an exponent"),
-        ("def f():\n  x = 1e-6\nend\n", "line 2: 1e-6 has an exponent"),
     ],
 )
 def test_what_reports_contradict_about_runs_and_is_recorded(text: str, doubt: str) -> None:
@@ -233,12 +196,6 @@ def test_a_program_that_is_rejected_leaves_the_running_one() -> None:
     assert "syntax error: line 2: the name speedj does not exist, or is not modelled" in refused.why
     assert refused.detail == {"error": "compile_error_name_not_found:speedj:", "line": 2, "column": 3}
     assert answer(robot, "programState") == "PLAYING g"
-
-
-def test_a_function_exists_from_its_version_on() -> None:
-    text = "def f():\n  set_target_payload(1, [0, 0, 0.1], [0, 0, 0, 0, 0, 0])\nend\n"
-    for polyscope, known in {(5, 9, 0): False, (5, 10, 0): True, (3, 14, 0): False, (10, 11, 0): True}.items():
-        assert start_upload(new_robot(polyscope), Upload("f", text, secondary=False)) is known
 
 
 WORDS = ["def f():\n", "thread t():\n", "if True:\n", "else:\n", "while x < 3:\n", "end\n", "break\n", "halt\n", "\n"]

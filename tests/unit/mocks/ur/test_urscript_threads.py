@@ -1,13 +1,10 @@
 """URScript programs that wait and move: threads, the heartbeat of a guarded move, popups, settings."""
 
-from itertools import pairwise
-
-import numpy as np
 import pytest
 
 from ftmocks.ur.modes import Runtime
 from ftmocks.ur.robot import Robot
-from tests.unit.mocks.ur.urscript_robot import HOME, end_of, logged, new_robot, results, run, start
+from tests.unit.mocks.ur.urscript_robot import results, run, start
 
 GUARDED = """
 def segment():
@@ -41,17 +38,6 @@ end
 """
 
 
-@pytest.mark.parametrize("scale", [1.0, 20.0])
-def test_sleep_lasts_in_the_time_of_the_arm_and_steps_in_that_of_the_cell(scale: float) -> None:
-    robot = start("def f():\n  sleep(0.3)\n  sleep(1.0)\n  textmsg(get_steptime())\nend\n", new_robot(time_scale=scale))
-    while robot.runtime == Runtime.PLAYING:
-        robot.tick()
-    started = next(event for event in robot.events if event.what == "started f")
-    lasted_s = end_of(robot).t_robot_s - started.t_robot_s
-    assert lasted_s == pytest.approx(1.3, abs=2.1 * robot.period_s * scale)
-    assert logged(robot) == ["0.002"]
-
-
 def beat(robot: Robot, seconds: float) -> None:
     """Let the client count its heartbeat every 8 ms."""
     for _ in range(round(seconds / 0.008)):
@@ -68,12 +54,6 @@ def guarded() -> Robot:
     return robot
 
 
-def test_a_guarded_move_ends_while_the_heartbeat_counts(guarded: Robot) -> None:
-    beat(guarded, 5.0)
-    assert guarded.output_ints[24] == 1
-    assert guarded.arm.q[5] == 2.785
-
-
 def test_a_guarded_move_stops_when_the_heartbeat_stands_still(guarded: Robot) -> None:
     run(guarded, 0.19)
     assert guarded.arm.qd[5] == pytest.approx(0.5, rel=1e-9)
@@ -84,28 +64,6 @@ def test_a_guarded_move_stops_when_the_heartbeat_stands_still(guarded: Robot) ->
     assert guarded.output_ints[24] == -1
     run(guarded, 0.01)
     assert guarded.runtime == Runtime.STOPPED
-
-
-def test_the_stop_behind_a_kill_decelerates_as_it_says_from_the_first_cycle(guarded: Robot) -> None:
-    guarded.write_inputs({"input_int_register_25": 1})
-    speeds = [guarded.arm.qd[5]]
-    while not guarded.arm.at_rest:
-        guarded.tick()
-        speeds.append(guarded.arm.qd[5])
-    drops = [before - after for before, after in pairwise(speeds)]
-    assert np.max(drops) <= 2.0 * guarded.period_s + 1e-12
-    assert len(speeds) == pytest.approx(1 + 0.5 / 2.0 / guarded.period_s, abs=2)
-
-
-def test_a_killed_thread_gives_the_arm_away_to_another_move() -> None:
-    goal = [*HOME[:5], HOME[5] - 0.1]
-    robot = start(
-        "def f():\n  thread mover():\n    movej([0, -1.5, 1, -1, 1.5, 0])\n  end\n  thr = run mover()\n  sleep(0.05)\n"
-        f"  kill thr\n  movej({goal})\nend\n"
-    )
-    run(robot, 3.0)
-    assert end_of(robot).why == "ended"
-    assert list(robot.arm.q) == goal
 
 
 SIDE_BY_SIDE = """

@@ -50,13 +50,6 @@ def test_marks_of_posix(data: bytes, wire: str) -> None:
     assert marked(data) == bytes.fromhex(wire)
 
 
-@given(wrong(), st.integers(-40, 40) | st.none(), st.integers(-40, 40) | st.none(), st.sampled_from([None, 1, -1, 2]))
-def test_a_slice_knows_its_wrong_byte(data: WrongParity, start: int | None, stop: int | None, step: int | None) -> None:
-    characters = [(byte, i == data.at) for i, byte in enumerate(data)]
-    assert unmarked(marked(data)) == characters
-    assert unmarked(marked(data[start:stop:step])) == characters[start:stop:step]
-
-
 @given(st.integers(0, 2**32))
 def test_corrupt_shows_when_an_odd_number_of_bits_is_wrong(seed: int) -> None:
     frame = bytes(range(13))
