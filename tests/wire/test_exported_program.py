@@ -71,15 +71,12 @@ def test_it_asks_and_then_visits_every_pose_at_rest(plan: Plan, start: Callable[
     assert "The tour is complete." in events(state, "popup")
 
 
-@pytest.mark.parametrize("away_deg", [35.0, -35.0])
-def test_far_from_the_first_pose_it_moves_nothing(
-    plan: Plan, start: Callable[[float], Station], away_deg: float
-) -> None:
-    station = start(away_deg)
+def test_far_from_the_first_pose_it_moves_nothing(plan: Plan, start: Callable[[float], Station]) -> None:
+    station = start(-35.0)
     station.ask("close-popup")
     station.wait_for(lambda state: "jog all joints" in (state["popup"] or ""))
     station.ask("close-popup")
     station.wait_for(lambda state: state["runtime_state"] == "STOPPED")
     state = station.ask("state")
-    assert state["q_rad"][5] == pytest.approx(plan.steps[0].q_rad[5] + radians(away_deg), abs=1e-3)
+    assert state["q_rad"][5] == pytest.approx(plan.steps[0].q_rad[5] + radians(-35.0), abs=1e-3)
     assert not any(": pose " in words for words in events(state, "textmsg"))

@@ -46,14 +46,6 @@ def start(cell_time: Any) -> Iterator[Callable[..., str]]:
     [
         (
             AtiCanNode,
-            {},
-            250_000,
-            0x20,
-            "ati-can://{}?interface=slcan&bitrate=250000",
-            "ATI NETCANOEM, serial FT12345, firmware 3.8 build 2",
-        ),
-        (
-            AtiCanNode,
             {"base": 0x7F, "bitrate": 500_000},
             500_000,
             0x7F,
@@ -98,11 +90,6 @@ def test_the_address_of_an_adapter_with_a_strange_name_works(
     assert answer.url is not None
     with sensor_from_url(answer.url, clock=cell_time.of_drivers) as sensor:
         assert len(sensor.collect(0.2).seq)
-
-
-def test_a_sensor_elsewhere_is_not_found(start: Callable[..., str], cell_time: Any) -> None:
-    assert probe_can(start(AtiCanNode, base=0x7F), interface="slcan", clock=cell_time.of_drivers, bitrate=250_000) == []
-    assert probe_can(start(RobotousCanNode), interface="slcan", clock=cell_time.of_drivers, bitrate=500_000) == []
 
 
 def test_a_bus_that_does_not_open() -> None:

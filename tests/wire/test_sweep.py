@@ -42,7 +42,7 @@ def curve(arm: UrArm, seconds: float) -> Sweep:
 
 def test_a_sweep_on_the_wire_follows_the_curve(arm: UrArm) -> None:
     arm.move_to(arm.state().q_rad.tolist(), timeout_s=20, guard=lambda: None)
-    sweep = curve(arm, 5.0)
+    sweep = curve(arm, 4.0)
     with arm.follow() as follow:
         arm.sweep(sweep, guard=lambda: None)
         states = follow.read(1.0)

@@ -18,20 +18,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import Control
-from ftdrivers.ur.kinematics import forward, kinematics_of
 from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, Station, on_ur_rtde, one_path
 from tests.wire.moves import away, no_guard
-from tests.wire.waiting import control_process, wait_until
+from tests.wire.waiting import control_process
 
 pytestmark = pytest.mark.slow  # every test needs a process of its own
 
-TCP = (0.1, -0.02, 0.25, 0.3, -1.2, 0.7)
 
 NewArm = Callable[..., UrArm]
 
@@ -50,28 +47,6 @@ class Trigger:
 
 
 # ---------------------------------------------------------------------- reading
-
-
-def assert_flange_is_right(arm: UrArm) -> None:
-    state = arm.state()
-    own = kinematics_of(arm.identify())
-    assert own is not None
-    flange = forward(own, state.q_rad)
-    assert np.allclose(state.R_base_flange, flange.R, atol=1e-6)
-    assert np.allclose(state.p_base_flange_m, flange.p_m, atol=1e-6)
-    tcp_offset = arm.status().tcp_offset
-    assert tcp_offset is not None
-    assert Rotation.from_rotvec(tcp_offset[3:]).magnitude() > 0.5  # there is something to take off
-
-
-@one_path
-def test_the_flange_does_not_depend_on_the_tcp(station: Station, new_arm: NewArm) -> None:
-    arm = new_arm()
-    arm.open()
-    before = arm.state()
-    station.ask("set-tcp", tcp=TCP)
-    assert_flange_is_right(arm)
-    assert np.allclose(arm.state().R_base_flange, before.R_base_flange, atol=1e-9)
 
 
 @one_path
@@ -113,56 +88,9 @@ def test_reading_disturbs_nothing_and_needs_no_remote_control(station: Station, 
     station.ask("remote-control", on=True)
 
 
-@one_path
-def test_identity_and_clock(station: Station, new_arm: NewArm) -> None:
-    arm = new_arm()
-    arm.open()
-    arm.open()
-    info = arm.identify()
-    assert (info.model, info.serial) == ("UR5e", "20225500001")
-    assert info.firmware.startswith("5.15")
-    begin_ns = station.clock.now_ns()
-    first, second = arm.state(), arm.state()
-    assert begin_ns <= first.t_host_ns <= second.t_host_ns <= station.clock.now_ns()
-    assert second.t_device_s > first.t_device_s
-    assert first.q_rad == pytest.approx(station.ask("state")["q_rad"], abs=1e-6)
-    threads = [thread.name for thread in threading.enumerate()]
-    arm.close()
-    left = [thread.name for thread in threading.enumerate()]
-    assert "ur-reader" in threads
-    assert "ur-reader" not in left
-
-
-@one_path
-def test_status_is_what_the_controller_reports_now(station: Station, new_arm: NewArm) -> None:
-    arm = new_arm()
-    arm.open()
-    status = arm.status()
-    assert (status.robot_mode, status.safety_mode, status.program) == ("running", "normal", "stopped")
-    assert status.fault is None
-    assert 0 < status.speed_slider <= 1
-    assert 0 < status.speed_scaling <= 1
-    assert status.payload_kg is not None
-    assert status.payload_kg >= 0
-    assert status.p_flange_payload_m is not None
-    assert len(status.p_flange_payload_m) == 3
-    assert arm.in_remote_control()
-    station.ask("set-tcp", tcp=TCP)
-    station.ask("remote-control", on=False)
-    station.ask("protective-stop")
-    wait_until(lambda: arm.status().safety_mode == "protective stop")
-    status = arm.status()
-    assert status.tcp_offset == pytest.approx(TCP)
-    assert status.fault is not None
-    assert arm.in_remote_control() is False
-    station.ask("freeze")
-    station.clock.sleep(0.1)  # what a status may be old
-    with pytest.raises(DeviceTimeout, match="been stuck"):
-        arm.status()
-    station.kill()
-
-
-@pytest.mark.parametrize("stopped", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize(
+    ("control", "stopped"), [("auto", False), ("auto", True), ("script", True)], indirect=["control"]
+)
 def test_others_may_look_and_stop_while_the_arm_moves(station: Station, arm: UrArm, stopped: bool) -> None:
     # Long enough for a looker on a busy computer.
     q0, q, done = arm.state().q_rad[5], away(arm, 2.5), threading.Event()
@@ -239,29 +167,11 @@ def test_each_move_has_its_own_speed(station: Station, arm: UrArm) -> None:
         assert stood_s - began_s == pytest.approx(expected_s, rel=0.02)
 
 
-def test_what_the_controller_refuses(start_station: Callable[..., Station]) -> None:
-    station = start_station("--joint-limit-deg", "170")
-    arm = station.arm()
-    try:
-        arm.open(control=True)
-        q = arm.state().q_rad.tolist()
-        assert arm.within_safety_limits(q)
-        q[5] = radians(175)
-        assert not arm.within_safety_limits(q)
-        station.ask("protective-stop")
-        with pytest.raises(DeviceFault, match="protective stop"):  # not "no"
-            arm.within_safety_limits(q)
-    finally:
-        arm.close()
-
-
 class EnoughError(Exception):
     pass
 
 
-@pytest.mark.parametrize(
-    "by", ["ctrl-c", "stop", *(pytest.param(by, marks=pytest.mark.slow) for by in ("guard", "time-out"))]
-)
+@pytest.mark.parametrize("by", ["ctrl-c", "stop", "guard", "time-out"])
 def test_whatever_ends_the_wait_stops_the_arm_and_leaves_it_usable(station: Station, arm: UrArm, by: str) -> None:
     def enough() -> None:
         raise EnoughError
@@ -284,7 +194,6 @@ def test_whatever_ends_the_wait_stops_the_arm_and_leaves_it_usable(station: Stat
     arm.move_to(here.tolist(), timeout_s=30, guard=no_guard)
 
 
-@pytest.mark.slow
 def test_a_second_ctrl_c_does_not_let_the_arm_move_on(
     station: Station, controls: list[Control], arm: UrArm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -306,7 +215,6 @@ def test_a_second_ctrl_c_does_not_let_the_arm_move_on(
     assert abs(state["q_rad"][5] - q[5]) > 0.1
 
 
-@pytest.mark.slow
 def test_close_in_the_middle_of_a_move_stops_the_arm(station: Station, controls: list[Control], arm: UrArm) -> None:
     q = away(arm)
     controls[-1].call("move", q, SPEED_RAD_S, ACCELERATION_RAD_S2)
@@ -321,7 +229,6 @@ def test_close_in_the_middle_of_a_move_stops_the_arm(station: Station, controls:
 # ---------------------------------------------------------------------- faults
 
 
-@pytest.mark.slow
 @on_ur_rtde
 def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
     pid = control_process()
@@ -336,7 +243,6 @@ def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
     arm.move_to(q, timeout_s=30, guard=no_guard)
 
 
-@pytest.mark.slow
 @on_ur_rtde
 def test_a_control_process_that_hangs(station: Station, new_arm: NewArm, caplog: pytest.LogCaptureFixture) -> None:
     arm = new_arm(timing=replace(UrTiming.emulated(), progress_s=2.0))
@@ -392,7 +298,7 @@ def application(station: Station, tmp_path: Path) -> Iterator[subprocess.Popen[s
             application.kill()
 
 
-@pytest.mark.slow
+@one_path
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_the_arm_stops_with_its_application(
     station: Station, application: subprocess.Popen[str], new_arm: NewArm, how: signal.Signals

@@ -7,14 +7,9 @@ import socket
 import struct
 from collections.abc import Iterator
 from random import Random
-from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from ftdrive.cell.emulated_clock import EmulatedClock
-from ftmocks.clock import LEAD_NS
 from ftmocks.ur import rtde
 from ftmocks.ur.uploads import take_uploads
 from ftmocks.ur.variables import INPUTS, OUTPUTS
@@ -93,43 +88,9 @@ def test_commands_as_ur_rtde_sends_them(data: str, names: list[str], fields: dic
     assert recipe.unpack(payload[1:]).items() >= fields.items()
 
 
-@given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)), max_size=6), st.integers(1, 9))
-def test_packages_survive_any_cutting_of_the_stream(packages: list[tuple[int, bytes]], step: int) -> None:
-    stream = b"".join(rtde.package(kind, payload) for kind, payload in packages)
-    buffer, found = bytearray(), []
-    for i in range(0, len(stream), step):
-        buffer += stream[i : i + step]
-        found += list(rtde.take_packages(buffer))
-    assert found == packages
-    assert buffer == b""
-
-
 def test_a_package_smaller_than_its_header_is_an_error() -> None:
     with pytest.raises(rtde.RtdeError, match="2 bytes"):
         list(rtde.take_packages(bytearray(b"\x00\x02V")))
-
-
-values = {
-    "BOOL": st.booleans(),
-    "UINT8": st.integers(0, 2**8 - 1),
-    "UINT32": st.integers(0, 2**32 - 1),
-    "UINT64": st.integers(0, 2**64 - 1),
-    "INT32": st.integers(-(2**31), 2**31 - 1),
-    "DOUBLE": st.floats(allow_nan=False),
-    "VECTOR3D": st.tuples(*[st.floats(allow_nan=False)] * 3),
-    "VECTOR6D": st.tuples(*[st.floats(allow_nan=False)] * 6),
-    "VECTOR6INT32": st.tuples(*[st.integers(-(2**31), 2**31 - 1)] * 6),
-    "VECTOR6UINT32": st.tuples(*[st.integers(0, 2**32 - 1)] * 6),
-}
-
-
-@given(st.lists(st.sampled_from(sorted(values)).flatmap(lambda t: st.tuples(st.just(t), values[t])), min_size=1))
-def test_recipes_decode_what_they_encode(fields: list[tuple[str, Any]]) -> None:
-    names = [f"v{i}" for i in range(len(fields))]
-    recipe = rtde.Recipe(3, names, [kind for kind, _value in fields])
-    ((_kind, payload),) = rtde.take_packages(bytearray(recipe.pack([value for _kind, value in fields])))
-    assert payload[0] == 3
-    assert list(recipe.unpack(payload[1:]).values()) == [value for _kind, value in fields]
 
 
 def test_programs_are_cut_at_end_in_column_zero() -> None:
@@ -241,14 +202,6 @@ def test_a_station_ends(how: str) -> None:
             cell.process.send_signal(signal.SIGTERM)
             assert cell.process.wait(LIMIT_S) == 0
         assert cell.quit() == 0
-
-
-def test_the_clock_goes_on_when_the_station_was_killed() -> None:
-    with StationProcess() as cell:
-        clock = EmulatedClock(cell.hello["clock"])
-        before_ns = clock.now_ns()
-        cell.kill()
-        wait_until(lambda: clock.now_ns() > before_ns + 10 * LEAD_NS)
 
 
 def test_dashboard_lines_end_with_a_bare_line_feed(station: StationProcess) -> None:

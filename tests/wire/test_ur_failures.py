@@ -40,7 +40,6 @@ import re
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -58,7 +57,6 @@ from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, St
 from tests.wire.moves import STEP_RAD, away, no_guard
 from tests.wire.waiting import control_process
 
-ROOT = Path(__file__).parents[2]
 MOVE_S = 60.0
 EMULATED = replace(UrTiming.emulated(), ours_s=2.0, ours_again_s=2.0, ours_closing_s=2.0, release_s=1.0, braking_s=5.0)
 """Here other clients never answer, brake or let go."""
@@ -189,19 +187,22 @@ EVENTS = [
     ),
 ]
 
+NAMES = [event.name for event in EVENTS]
 
-def events(*names: str, fast: str = "", script: Sequence[str] | None = None) -> pytest.MarkDecorator:
-    """Parametrize by control path and event: all events where none is named; slow but for one.
 
-    `script` names those on the path of our own program, where the paths differ.
+def events(*, auto: Sequence[str] = NAMES, script: Sequence[str], fast: str = "") -> pytest.MarkDecorator:
+    """Parametrize by control path and event; slow but for one.
+
+    Most of what is done about an event is the same on both paths: every event befalls each path at some moment, and
+    where the paths differ it is the same moment.
     """
     return pytest.mark.parametrize(
         ("control", "event"),
         [
             pytest.param(path, event, marks=[] if (path, event.name) == ("auto", fast) else [slow])
-            for path in ("auto", "script")
+            for path, names in (("auto", auto), ("script", script))
             for event in EVENTS
-            if (not names or event.name in names) and (path == "auto" or script is None or event.name in script)
+            if event.name in names
         ],
         indirect=["control"],
         ids=str,
@@ -259,7 +260,13 @@ class Once:
 # ---------------------------------------------------------------------- the controller and the links
 
 
-@events(fast="protective-stop")
+@events(
+    fast="protective-stop",
+    script=[
+        *("protective-stop", "program-stop", "program-pause", "crash-script", "foreign-program", "rtde-silent"),
+        *("cable", "freeze", "cut"),
+    ],
+)
 def test_in_move(station: Station, new_arm: NewArm, event: Event, control: ControlPath) -> None:
     arm = opened(new_arm())
     q = away(arm)
@@ -277,8 +284,8 @@ def test_in_move(station: Station, new_arm: NewArm, event: Event, control: Contr
 
 
 @events(
-    *("protective-stop", "power-off", "program-stop", "foreign-program", "rtde-reset", "rtde-silent", "cut"),
-    script=("protective-stop", "foreign-program", "rtde-silent"),
+    auto=["protective-stop", "program-stop", "foreign-program", "rtde-silent", "cut"],
+    script=["power-off", "rtde-reset"],
 )
 def test_at_rest(station: Station, new_arm: NewArm, event: Event) -> None:
     arm = opened(new_arm())
@@ -296,8 +303,7 @@ def test_at_rest(station: Station, new_arm: NewArm, event: Event) -> None:
 
 
 @events(
-    *("protective-stop", "emergency-stop", "brakes", "rtde-fin", "rtde-silent", "cable", "freeze", "cut"),
-    script=("protective-stop", "cable", "cut"),
+    auto=["protective-stop", "rtde-fin", "rtde-silent", "cable", "freeze", "cut"], script=["emergency-stop", "brakes"]
 )
 def test_while_opening(
     station: Station, new_arm: NewArm, event: Event, control: ControlPath, monkeypatch: pytest.MonkeyPatch
@@ -319,8 +325,8 @@ def test_while_opening(
 
 
 @events(
-    *("protective-stop", "safeguard", "program-pause", "foreign-program", "rtde-fin", "rtde-silent", "cable"),
-    script=("protective-stop", "foreign-program", "cable"),
+    auto=["protective-stop", "program-pause", "foreign-program", "rtde-silent", "cable"],
+    script=["safeguard", "rtde-fin"],
 )
 def test_while_closing(station: Station, controls: list[Control], new_arm: NewArm, event: Event) -> None:
     arm = opened(new_arm())
@@ -374,6 +380,7 @@ def test_the_port_of_our_program_may_close_in_a_move(station: Station, arm: UrAr
 
 
 @slow
+@one_path
 def test_a_slider_at_zero(station: Station, arm: UrArm) -> None:
     q = away(arm)
     provoke = Once(lambda: station.ask("slider", fraction=0.0), wait_until_moving(arm))
@@ -387,6 +394,7 @@ def test_a_slider_at_zero(station: Station, arm: UrArm) -> None:
 
 
 @slow
+@one_path
 def test_an_end_before_the_goal_is_no_arrival(
     station: Station, control: ControlPath, arm: UrArm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -435,6 +443,7 @@ def test_a_new_arm_moves_after_a_protective_stop(station: Station, arm: UrArm, n
 
 
 @slow
+@one_path
 def test_a_program_of_another_client_is_not_stopped_by_leaving(
     station: Station, arm: UrArm, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -494,6 +503,7 @@ def test_a_program_of_another_client_is_never_ended_for_a_start(station: Station
 
 
 @slow
+@one_path
 def test_a_program_that_took_the_place_of_ours_is_not_ended_when_the_arm_is_opened_again(
     station: Station, arm: UrArm
 ) -> None:
@@ -532,6 +542,3 @@ def refused(station: Station, **how: Any) -> ConnectError:
         arm.open(control=True)
     arm.close()
     return caught.value
-
-
-# ---------------------------------------------------------------------- our own processes

@@ -24,9 +24,6 @@ pytestmark = pytest.mark.slow
         ("3.15.8", "UR5"),
         ("5.4.0", "UR3e"),
         ("5.9.4", "UR5e"),
-        ("5.10.2", "UR10e"),
-        ("5.15.0", "UR16e"),
-        ("5.23.0", "UR20"),
         ("5.26.0", "UR30"),
         ("10.11.0", "UR20"),
         ("10.14.0", "UR5e"),
@@ -64,7 +61,6 @@ def test_open_state_move_stop_limits_close(start_station: Callable[..., Station]
         (("--kinematics-message", "none"), None, None),
         (("--kinematics-message", "wrong"), None, "kinematics sent by the controller: the two disagree"),
         (("--model", "UR10e", "--polyscope", "5.4.0"), "UR5e", "the arm is another model, probably a UR10e"),
-        (("--model", "UR10e"), "UR5e", "is a UR10e, not a UR5e"),
     ],
 )
 def test_an_arm_without_kinematics_is_read_and_another_one_is_refused(

@@ -3,26 +3,11 @@
 import numpy as np
 import pytest
 
-from ftdrivers.errors import DeviceFault, DeviceTimeout
-from ftdrivers.interfaces import ArmStates, ControllerSettings, RobotArm
+from ftdrivers.errors import ConnectError, DeviceFault
+from ftdrivers.interfaces import ArmState, ControllerSettings, DeviceInfo, ReadOnlyArm, RobotArm
 from ftdrivers.sweep import Sweep
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import FakeArm
-
-
-def test_an_arm_that_can_only_be_asked_is_followed_state_by_state() -> None:
-    clock = FakeClock()
-    arm = FakeArm(clock)
-    with arm.follow() as follow:
-        states = ArmStates.concatenate([follow.read(0.1) for _ in range(5)])
-        assert np.diff(states.t_host_ns).tolist() == [8_000_000] * 4
-        assert states.q_rad == pytest.approx(np.tile(arm.q, (5, 1)))
-        assert states.R_base_flange.shape == (5, 3, 3)
-        assert states.p_base_flange_m[3] == pytest.approx(arm.state().p_base_flange_m)
-        assert states.rows(slice(1, 3)).t_host_ns.tolist() == states.t_host_ns[1:3].tolist()
-        arm.gone = DeviceTimeout("its clock stands still")
-        with pytest.raises(DeviceTimeout, match="stands still"):
-            follow.read(0.1)
 
 
 def test_an_arm_whose_driver_sets_nothing_says_what_it_was_to_set() -> None:
@@ -35,3 +20,24 @@ def test_an_arm_whose_driver_sets_nothing_says_what_it_was_to_set() -> None:
         RobotArm.sweep(arm, sweep, guard=lambda: None)
     with pytest.raises(DeviceFault, match=r"gravity of \[0.0, 0.0, 9.82\]"):
         arm.set_gravity((0.0, 0.0, 9.82))
+
+
+class Fixed(ReadOnlyArm):
+    def identify(self) -> DeviceInfo:
+        return DeviceInfo("bench", "1", "none")
+
+    def state(self) -> ArmState:
+        return ArmState(7, 0.5, np.zeros(6), np.zeros(6), np.eye(3), np.zeros(3))
+
+
+def test_an_arm_that_is_only_read_refuses_control_and_motion_and_may_be_stopped() -> None:
+    arm = Fixed()
+    with pytest.raises(ConnectError, match="only reads"):
+        arm.open(control=True)
+    with pytest.raises(DeviceFault, match="only reads"):
+        arm.move_to([0.0] * 6, timeout_s=1.0, guard=lambda: None)
+    with pytest.raises(DeviceFault, match="only reads"):
+        arm.wait_until_still(timeout_s=1.0, guard=lambda: None)
+    with pytest.raises(DeviceFault, match="only reads"):
+        arm.within_safety_limits([0.0] * 6)
+    arm.stop()

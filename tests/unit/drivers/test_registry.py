@@ -26,6 +26,12 @@ from ftdrivers.ur.arm import UrArm
 from ftdrivers.wires.serial_port import SerialPort
 
 
+def test_a_strange_name_of_a_port_is_read_back_from_its_address() -> None:
+    for path in ("/dev/my port #1?50%20", "/dev/ü&=+[x]", "a:b@c/d"):
+        parts = split_url(f"bota://{in_url(path)}?baud=460800")
+        assert (parts.address, parts.query, parts.fragment) == (path, "baud=460800", "")
+
+
 def test_usual_names_stand_in_an_address_as_they_are() -> None:
     for path in ("/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0-port0", "COM3", "/dev/ttyACM0@1000000"):
         assert in_url(path) == path

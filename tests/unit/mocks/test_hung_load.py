@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftmocks.clock import CellClock
 from ftmocks.hung_load import HungLoad
-from ftmocks.kinematics import forward, vector6
-from ftmocks.ur.motion import JointMove, LineMove
-from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.kinematics import forward
+from ftmocks.ur.robot import Robot
 from ftmocks.workcell import Workcell
 from ftmocks.world import Truth, World
-from tests.unit.mocks.real_time import RealTime
 from tests.unit.mocks.test_world import DH, POSTURE, plain, reach
 
 Array = NDArray[np.float64]
@@ -26,12 +23,6 @@ DOWN = np.array([0.0, 0.0, -1.0])
 def load(string_m: float = 0.25, swing_deg: float = 0.0) -> HungLoad:
     aside = np.array([math.radians(swing_deg), 0.0, 0.0])
     return HungLoad(2.0, TIP_M, TIP_M, string_m, 9.81 * DOWN, np.zeros(3), aside)
-
-
-def cell(time_scale: float = 1.0) -> Robot:
-    world = World(plain(), DH, POSTURE, clock=CellClock(RealTime()))
-    world.hang(2.0, TIP_M, 0.25, 0.0)
-    return Robot(world, RobotSettings(time_scale=time_scale))
 
 
 def hung(robot: Robot) -> HungLoad:
@@ -110,33 +101,6 @@ def follow(one: HungLoad, at: Callable[[float], Array], seconds: float, cycle_s:
     return pulls
 
 
-def ran(robot: Robot, path: JointMove | LineMove) -> tuple[float, float]:
-    """Let the arm follow a path and stand: largest swing (degrees), and largest distance of the hook (m)."""
-    start, swing_deg, moved_m = hook(robot), 0.0, 0.0
-    robot.arm.start(path, "test")
-    for _ in range(2000):
-        robot.tick(robot.cycle_s + CYCLE_S)
-        swing_deg = max(swing_deg, hung(robot).swing_deg)
-        moved_m = max(moved_m, float(np.linalg.norm(hook(robot) - start)))
-        if not robot.arm.busy and robot.arm.motion is None:
-            break
-    return swing_deg, moved_m
-
-
 def hook(robot: Robot) -> Array:
     X = forward(DH, robot.world.q)
     return np.asarray(X[:3, :3] @ TIP_M + X[:3, 3])
-
-
-@pytest.mark.parametrize("time_scale", [1.0, 20.0])
-def test_a_hook_that_moves_leaves_a_swing_that_the_sensor_feels(time_scale: float) -> None:
-    robot = cell(time_scale)
-    goal = vector6(np.add(POSTURE, [0.6, 0, 0, 0, 0, 0]))
-    swing_deg, moved_m = ran(robot, JointMove(DH, goal, 1.0, 4.0))
-    assert moved_m > 0.2
-    assert swing_deg > 2.0
-    one = hung(robot)
-    R_base_sensor = forward(DH, robot.world.q)[:3, :3]
-    felt = robot.world.contact_wrench(robot.cycle_s)
-    np.testing.assert_allclose(R_base_sensor @ felt[:3], one.force_base_N, atol=1e-12)
-    np.testing.assert_allclose(felt[3:], np.cross(TIP_M, felt[:3]), atol=1e-12)

@@ -70,9 +70,6 @@ def test_tilt_turns_gravity_in_base(alpha_deg: float, beta_deg: float, down: lis
     np.testing.assert_allclose(truth.gravity_force_base_N, 9.81 * np.array(down), atol=1e-12)
 
 
-TURNED = vector6([*POSTURE[:5], POSTURE[5] + 0.7])
-
-
 @pytest.mark.parametrize(
     ("beyond_deg", "angle_deg", "degrees"), [(30, 40, 10), (30, 20, 0), (-30, -50, 20), (-30, 0, 0)]
 )

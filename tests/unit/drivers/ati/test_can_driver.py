@@ -192,12 +192,6 @@ def test_halves_pair_up_by_identifier_among_foreign_frames(make_wire: MakeWire) 
         assert sensor.health().lost == 0
 
 
-def test_stale_frames_are_purged_before_a_request(make_wire: MakeWire) -> None:
-    """A duplicate left over from the last reading must not become half of the next one."""
-    with opened(make_wire(last=[*GAUGES, (1.1, "200 0000700070007000")])) as sensor:
-        assert (sensor.collect(0.05).counts == COUNTS).all()
-
-
 def test_a_half_that_is_late_does_not_pair_up_with_the_next_reading(table: Table) -> None:
     late = [(1.0, GAUGES[0]), (53.0, "201 000400050006")]
     half = [(10.0, GAUGES[0])]
@@ -210,19 +204,6 @@ def test_a_half_that_is_late_does_not_pair_up_with_the_next_reading(table: Table
         assert sensor.health().lost == 2
         assert samples.seq[0] == 4
     left_alone(wire)
-
-
-@pytest.mark.parametrize(("after_ms", "asked"), [(99.0, 1), (101.0, 2), (None, 2)])
-def test_a_reply_of_the_start_up_has_a_tenth_of_a_second_and_is_asked_again(
-    table: Table, after_ms: float | None, asked: int
-) -> None:
-    reply = START_UP["205"]
-    late = [] if after_ms is None else [(after_ms, reply[0])]
-    turns = [("205", late), ("205", reply)][:asked]
-    rest = [(sent, received) for sent, received in START_UP.items() if sent != "205"]
-    wire = table.can(chain(turns, rest, repeat(("200", GAUGES))))
-    with opened(wire):
-        left_alone(wire)
 
 
 @pytest.mark.parametrize(

@@ -4,14 +4,9 @@ import pytest
 
 from ftdrivers.errors import ProtocolError
 from ftdrivers.robotiq import codec
-from ftdrivers.wires.framing import crc16_modbus
 
 FRAME = bytes.fromhex("20 4E D2 04 C9 FD 10 27 96 00 E7 FF E8 03 86 DC")
 START, STARTED = bytes.fromhex("09 10 01 9A 00 01 02 02 00 CD CA"), bytes.fromhex("09 10 01 9A 00 01 21 52")
-
-
-def with_crc(body: bytes) -> bytes:
-    return body + crc16_modbus(body).to_bytes(2, "little")
 
 
 @pytest.mark.parametrize("at", range(16))

@@ -69,15 +69,11 @@ def whole(samples: Iterable[int]) -> list[tuple[int, int, int]]:
     ("pattern", "believed"),
     [
         ("F0 S0 F1 S1 F2 S3 F4 S4 F5 S5", [0, 1, 4, 5]),  # two losses, and what is left takes turns
-        ("F0 S0 F1 S1 F2 S4 F5 S5 F6 S6", [0, 1, 5, 6]),
-        ("F0 S0 F1 S1 F2 S3 S4 F5 S5 F6 S6", [0, 1, 6]),
         ("F0 S0 F1 S1 F3 S3 F4 S4", [0, 1, 4]),  # one as a whole: it might have been two halves
         ("F0 S0 F1 S1 F2 F3 S3 F4 S4 F5 S5", [0, 1, 5]),
         ("F0 S0 F1 S1 S2 F3 S3 F4 S4", [0, 1, 4]),
         ("F0 S0 F1 F2 S1 S2 F3 S3 F4 S4", [0, 4]),  # changed places
-        ("F0 S0 S1 F1 S2 F2 S3 F3 F4 S4 F5 S5", [0, 5]),
         ("F0 S0 F1 S1 S1 F2 S2 F3 S3", [0, 3]),  # twice: a foreign half would look the same
-        ("F0 S0 F1 S1 F2 F2 S2 F3 S3 F4 S4", [0, 1, 4]),
         ("S0 F1 S1 F2 S2", [2]),
     ],
 )
@@ -90,14 +86,6 @@ def test_a_late_host_does_not_pair_what_was_lost() -> None:
     """It finds `F4 S5` among halves that are not crosswise, as if it had come so."""
     sent = halves("F2 S2 F3 S3 F4 S5 F6 S6 F7 S7 F8 S8 F9 S9")
     assert heard(in_step(), sent, [0.0] * 2 + [0.022]) == whole([2, 8, 9])
-
-
-@pytest.mark.parametrize("shift", [0.1, 0.3, 0.5, 0.6, 0.7, 0.9, 5.6])
-def test_a_sensor_that_pauses_is_believed_again(shift: float) -> None:
-    link = Halves(PERIOD_S)
-    heard(link, halves("F0 S0 F1 S1 F2 S2 F3 S3"))
-    later = [(t_s + shift * PERIOD_S, number, second) for t_s, number, second in halves(" ".join(MANY[4:]))]
-    assert len(heard(link, later)) > 190
 
 
 @given(

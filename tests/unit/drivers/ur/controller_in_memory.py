@@ -415,10 +415,6 @@ class ReaderInMemory(Reader):
         self._follow()
 
     @property
-    def newest_t_s(self) -> float:
-        return self._t_device_s
-
-    @property
     def n_followers(self) -> int:
         return len(self._followers)
 

@@ -155,15 +155,6 @@ def test_a_stop_whose_source_only_the_safety_mode_names(
     assert (f"{name} (safety mode {mode})", fix in status.fault.fix) == (status.fault.found, True)
 
 
-@pytest.mark.parametrize("mode", [3, 4])
-def test_joints_without_power_are_not_measured(controller: Controller, reader: Reader, mode: int) -> None:
-    controller.robot_mode = mode
-    with pytest.raises(DeviceFault, match="measure its joints"):
-        reader.state(never)
-    controller.robot_mode = 5  # idle: powered, brakes closed
-    reader.state(never)
-
-
 REAL_ARM = [7.4, 1.3]
 """mm and degrees from the nominal model, as the farthest of 30 real arms."""
 

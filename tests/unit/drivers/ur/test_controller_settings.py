@@ -172,8 +172,3 @@ def test_a_link_that_fails_is_an_error_of_the_device(
     with pytest.raises(kind, match=HOST):
         read(stream, monkeypatch)
     assert stream.closed
-
-
-def test_a_closed_arm_reads_nothing() -> None:
-    with pytest.raises(ConnectError, match="not open"):
-        UrArm(HOST).controller_settings()

@@ -88,18 +88,6 @@ def test_commands_without_reply(sensor: RobotousSensor[bytes], request_: str) ->
     assert sensor.execute(command(request_)) == []
 
 
-@pytest.mark.parametrize(("baud_code", "fastest_hz"), [(0, 333), (1, 1000), (2, 500), (3, 500), (4, 333), (5, 200)])
-def test_the_baud_rate_limits_the_rate(baud_code: int, fastest_hz: int, readings: Readings) -> None:
-    sensor = RobotousSerialBox(readings, baud_code=baud_code)
-    sensor.boot()
-    for code, rate_hz in enumerate([200, 10, 20, 50, 100, 200, 333, 500, 1000]):
-        before = sensor.rate_hz
-        allowed = rate_hz <= fastest_hz
-        assert sensor.execute(command(f"0F {code:02X}"))[0][1:3] == (b"\1\0" if allowed else b"\0\2")
-        assert sensor.rate_hz == (rate_hz if allowed else before)
-    assert RobotousCanNode(readings).execute(command("0F 08"))[0][1] == 1, "CAN carries every rate"
-
-
 def test_can_node_answers_at_its_identifiers(readings: Readings) -> None:
     node = RobotousCanNode(readings)
     node.boot()

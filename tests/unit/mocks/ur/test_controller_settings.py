@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ftmocks.kinematics import MODELS, Vector3, Vector6, vector3, vector6
+from ftmocks.kinematics import MODELS, Vector3, Vector6, vector3
 from ftmocks.ur.robot import Robot, RobotSettings
 from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.ur.variables import OUTPUTS
@@ -13,7 +13,6 @@ from ftmocks.world import Truth, World
 from tests.unit.mocks.ur.urscript_robot import HOME, run
 
 DH = MODELS["UR5e"]
-TURNED = vector6(np.radians([20, -80, 70, -120, 40, -30]))
 UPRIGHT = (0.0, 0.0, 9.82)
 WALL = (9.82, 0.0, 0.0)
 TRUTH = replace(

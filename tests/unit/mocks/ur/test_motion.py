@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 
 from ftmocks.kinematics import MODELS, Vector6, forward, matrix_of, pose_of, rotvec, vector6
 from ftmocks.ur.motion import Arm, JointMove, LineMove, Trapezoid
@@ -86,12 +85,6 @@ def test_stopj_takes_speed_over_deceleration() -> None:
     assert arm.qd[5] == pytest.approx(1.0)
     arm.stop_joints(2.0, "main")
     assert run(arm) == pytest.approx(0.5, abs=2 * DT)
-
-
-commands = st.lists(
-    st.tuples(st.sampled_from(["move", "stop", "release", "pause", "resume", "slow", "line"]), st.integers(0, 60)),
-    max_size=12,
-)
 
 
 def joint_move(arm: Arm) -> None:

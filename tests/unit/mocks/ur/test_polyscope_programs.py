@@ -103,17 +103,6 @@ TOWARDS = """def calculate_point_to_move_towards(feature, direction, position_di
     local wanted=pose_sub(pose_trans(feature, step), feature)
     return pose_add(get_target_tcp_pose(), wanted)
   end"""
-TIMER = """global timer_1=0
-  timer_1_is_counting = False
-  thread Timer_Thread_1():
-    while (True):
-      if (timer_1_is_counting):
-        timer_1 = timer_1 + get_steptime()
-      end
-      sync()
-    end
-  end
-  run Timer_Thread_1()"""
 
 
 def contact(robot: Robot) -> None:

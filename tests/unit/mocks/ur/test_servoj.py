@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ftmocks.ur.modes import Runtime, SafetyMode
 from ftmocks.ur.robot import Robot
-from tests.unit.mocks.ur.urscript_robot import HOME, failure, logged, new_robot, run, start
+from tests.unit.mocks.ur.urscript_robot import HOME, logged, new_robot, run, start
 
 TURN_RAD_S, LOOKAHEAD_S, SERVO_LAG_S = 1.5, 0.1, 0.005
 SWEEP = """def sweep():
@@ -115,8 +115,3 @@ def test_a_target_beyond_the_speed_of_the_joint_is_a_protective_stop(step_rad: f
         assert "joint 6 jumps by -0.0063 rad in 0.002 s" in stop.why
         assert robot.runtime == Runtime.PAUSED
         assert robot.arm.at_rest
-
-
-@pytest.mark.parametrize("given", ["t=0", "gain=50", "lookahead_time=0.3"])
-def test_an_argument_out_of_range_ends_the_program(given: str) -> None:
-    assert "out of range" in failure(f"  servoj(get_target_joint_positions(), {given})").why
