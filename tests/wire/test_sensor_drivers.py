@@ -162,11 +162,6 @@ def test_damage_is_dropped_and_counted(start: Start, scheme: str, fault: str) ->
     assert len(samples) > (0 if scheme == "robotous-can" else gaps)
 
 
-def test_robotiq_saturation_is_a_fault(start: Start) -> None:
-    with pytest.raises(DeviceFault, match="end of its range"):
-        start("robotiq-ft300", saturated_axis=2).sensor().open()
-
-
 @pytest.mark.parametrize(
     ("status", "says"), [(2, "overrange"), pytest.param(4, "invalid", marks=pytest.mark.slow), (8, "not in N")]
 )

@@ -10,7 +10,6 @@ import pytest
 
 from ftmocks.__main__ import main
 from tests.wire.station_process import StationProcess
-from tests.wire.waiting import LIMIT_S
 
 pytestmark = pytest.mark.slow  # every test needs a process of its own
 
@@ -106,19 +105,6 @@ def test_a_pushed_joint_and_a_changed_payload(station: StationProcess) -> None:
     station.ask("set-payload", payload_kg=2.6)  # its centre stays
     state = station.ask("state")
     assert (state["payload_kg"], state["payload_cog_m"]) == (2.6, [0.01, 0, 0.05])
-
-
-def test_a_silent_arm_keeps_its_connections_and_answers_later(station: StationProcess) -> None:
-    with station.connect(29999) as dashboard:
-        assert dashboard.recv(100).startswith(b"Connected")
-        station.ask("silence_arm")
-        dashboard.sendall(b"robotmode\n")
-        dashboard.settimeout(0.1)
-        with pytest.raises(TimeoutError):
-            dashboard.recv(100)
-        station.ask("silence_arm", on=False)
-        dashboard.settimeout(LIMIT_S)
-        assert dashboard.recv(100) == b"Robotmode: RUNNING\n"
 
 
 def test_requests_to_begin_with() -> None:

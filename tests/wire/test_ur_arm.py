@@ -50,22 +50,6 @@ class Trigger:
 
 
 @one_path
-def test_a_tcp_that_changes_while_reading_never_gives_a_wrong_flange(station: Station, new_arm: NewArm) -> None:
-    arm = new_arm()
-    arm.open()
-    expected = arm.state()
-    seen = set()
-    for k in range(20):
-        station.ask("set-tcp", tcp=[0.01 * k, 0, 0.2, 0.05 * k, 0, 0])
-        for _ in range(2):
-            state = arm.state()
-            assert np.allclose(state.p_base_flange_m, expected.p_base_flange_m, atol=1e-6)
-            assert np.allclose(state.R_base_flange, expected.R_base_flange, atol=1e-6)
-            seen.add(arm.status().tcp_offset)
-    assert len(seen) > 10
-
-
-@one_path
 def test_reading_disturbs_nothing_and_needs_no_remote_control(station: Station, arm: UrArm, new_arm: NewArm) -> None:
     reader = new_arm()
     q = away(arm)

@@ -1,7 +1,6 @@
 """The emulated UR controller on the wire: bytes of the RTDE guide, and a hand-written client."""
 
 import math
-import os
 import signal
 import socket
 import struct
@@ -217,32 +216,3 @@ def test_dashboard_lines_end_with_a_bare_line_feed(station: StationProcess) -> N
             b"Disconnected\n",
         ]
         assert lines.readline() == b""
-
-
-def test_options_override_the_seed_and_sensors_share_the_station(station: StationProcess) -> None:
-    options = ("--seed", "3", "--mass", "1.25", "--com", "0.001,0.002,0.06", "--mount", "ceiling", "--tilt-deg", "1,2")
-    others = ("--sensor-rotvec-deg", "0,0,90", "--tcp", "0,0,0.1,0,0,0", "--model", "UR10e", "--sensor", "both")
-    with StationProcess(*options, *others) as cell:
-        assert cell.host != station.host
-        truth = cell.hello["truth"]
-        assert truth["mass_kg"] == 1.25
-        assert truth["p_sensor_com_m"] == [0.001, 0.002, 0.06]
-        assert truth["R_flange_sensor"][1] == pytest.approx([1, 0, 0])
-        assert math.degrees(truth["tilt_alpha_rad"]) == pytest.approx(1)
-        assert math.degrees(truth["tilt_beta_rad"]) == pytest.approx(-178)
-        assert truth["gravity_force_base_N"][2] > 0
-        assert cell.hello["arm"]["model"] == "UR10e"
-        assert cell.ask("state")["tcp_offset"] == [0, 0, 0.1, 0, 0, 0]
-        can, serial = cell.hello["sensors"]["can"], cell.hello["sensors"]["serial"]
-        assert {key: can[key] for key in ("interface", "bitrate", "base")} == {
-            "interface": "slcan",
-            "bitrate": 250_000,
-            "base": 0x20,
-        }
-        assert can["channel"] != serial["port"]
-        for path in (can["channel"], serial["port"]):
-            os.close(os.open(path, os.O_RDWR | os.O_NOCTTY))
-        assert cell.ask("unplug", device="sensor") == {"done": "unplug", "devices": ["can", "serial"]}
-        with pytest.raises(OSError, match=can["channel"]):
-            os.open(can["channel"], os.O_RDWR | os.O_NOCTTY)
-        assert cell.quit() == 0

@@ -3,10 +3,7 @@
 import http.client
 import itertools
 import json
-import signal
 import struct
-import subprocess
-import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,33 +11,11 @@ import pytest
 
 from tests.wire.primary_socket import PrimarySocket
 from tests.wire.rtde_socket import RtdeSocket
-from tests.wire.station_process import ROOT, StationProcess
+from tests.wire.station_process import StationProcess
 
 pytestmark = pytest.mark.slow  # every test needs a process of its own
 
 SLEEPING = "def f():\n  sleep(1000)\nend\n"
-HEARTBEAT = """
-def guarded():
-  thread mover():
-    movej([0, -1.5, 1, -1, 1.5, 0], a=1.4, v=0.2)
-    return False
-  end
-  thr = run mover()
-  beat = read_input_integer_register(24)
-  missed_s = 0.0
-  while missed_s < 0.2:
-    sync()
-    missed_s = missed_s + get_steptime()
-    if read_input_integer_register(24) != beat:
-      beat = read_input_integer_register(24)
-      missed_s = 0.0
-    end
-  end
-  kill thr
-  stopj(2)
-  textmsg("heartbeat lost at ", beat)
-end
-"""
 
 
 @pytest.fixture(scope="module")
@@ -88,15 +63,6 @@ def first_us(client: PrimarySocket) -> int:
     return int(client.received[3]["mode"]["timestamp"])
 
 
-def test_port_30002_runs_programs_and_reports_nothing_of_them(station: StationProcess) -> None:
-    with PrimarySocket(station.host, 30002) as client:
-        client.send('def quiet():\n  textmsg("hello")\n  sync()\nend\n')
-        station.wait_for_event("stopped quiet")
-        client.next("state")
-        client.next("state")
-        assert {message["type"] for message in client.received[3:]} == {"state"}
-
-
 def test_a_program_from_port_30001_runs_and_is_heard_by_every_client(station: StationProcess) -> None:
     with PrimarySocket(station.host) as sender, PrimarySocket(station.host) as listener:
         listener.next("version")
@@ -106,14 +72,6 @@ def test_a_program_from_port_30001_runs_and_is_heard_by_every_client(station: St
             assert client.next("text")["text"] == "hello"
             assert client.next("key")["title"] == "PROGRAM_XXX_STOPPED"
     assert station.wait_for_event("program f")["by"] == "primary port"
-
-
-def test_doubtful_urscript_runs_and_stands_beside_the_bad_inputs(station: StationProcess) -> None:
-    known = station.ask("state")["bad_inputs"]
-    with PrimarySocket(station.host) as client:
-        client.send("def f():\n  # a comment\n  sync()\nend\n")
-        assert client.next("key")["title"] == "PROGRAM_XXX_STARTED"
-    assert station.ask("state")["bad_inputs"] == [*known, "URScript: the program has lines of comment"]
 
 
 def test_local_control_ends_connections_and_lets_new_ones_only_read(station: StationProcess) -> None:
@@ -133,56 +91,6 @@ def test_local_control_ends_connections_and_lets_new_ones_only_read(station: Sta
     with PrimarySocket(station.host) as client:
         client.send(SLEEPING)
         assert client.next("key")["title"] == "PROGRAM_XXX_STARTED"
-
-
-CLIENT = """
-import socket, struct, sys
-
-from ftdrive.cell.emulated_clock import EmulatedClock
-
-rtde, primary = (socket.create_connection((sys.argv[1], port)) for port in (30004, 30001))
-
-def send(kind, payload):
-    rtde.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
-
-clock, beat = EmulatedClock(sys.argv[2]), 0
-with clock.keeping_up():
-    send("I", b"input_int_register_24")
-    primary.sendall(sys.stdin.read().encode())
-    while True:
-        beat += 1
-        send("U", b"\\1" + struct.pack(">i", beat))
-        clock.sleep(0.005)
-"""
-
-
-@pytest.mark.parametrize("how", ["killed", "silenced"])
-def test_a_program_stops_the_arm_when_its_client_is_gone_and_registers_keep_their_value(
-    station: StationProcess, how: str
-) -> None:
-    known = len(station.ask("state")["events"])
-    command = [sys.executable, "-c", CLIENT, station.host, station.hello["clock"]]
-    client = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE)
-    try:
-        assert client.stdin is not None
-        client.stdin.write(HEARTBEAT.encode())
-        client.stdin.close()
-        station.wait_for(lambda state: state["moving"])
-        if how == "silenced":
-            station.ask("silence-arm")
-        client.send_signal(signal.SIGKILL)
-        lost = station.wait_for_event("textmsg", since=known)
-        assert station.wait_for_event("stands", since=known)["t_robot_s"] <= lost["t_robot_s"]
-    finally:
-        client.kill()
-        client.wait()
-    station.ask("silence-arm", on=False)
-    with RtdeSocket(station.host) as rtde:
-        rtde.ask("O", struct.pack(">d", 125.0) + b"input_int_register_24")
-        rtde.ask("S")
-        (kept,) = struct.unpack(">i", rtde.answer()[4:])
-    last = int(lost["why"].removeprefix("heartbeat lost at "))
-    assert kept == last or (how == "silenced" and kept > last)  # beats that waited in a silent connection arrive late
 
 
 def test_polyscope_x_has_the_robot_api_in_place_of_the_dashboard(polyscope_x: StationProcess) -> None:

@@ -432,18 +432,6 @@ def test_a_move_paused_by_a_protective_stop_cannot_be_played(station: Station, a
 
 @slow
 @one_path
-def test_a_new_arm_moves_after_a_protective_stop(station: Station, arm: UrArm, new_arm: NewArm) -> None:
-    station.ask("protective-stop")
-    arm.close()
-    another = new_arm()
-    with pytest.raises(ConnectError, match="protective stop"):
-        another.open(control=True)
-    unlock(station)
-    moves_again(another)
-
-
-@slow
-@one_path
 def test_a_program_of_another_client_is_not_stopped_by_leaving(
     station: Station, arm: UrArm, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -100,11 +100,3 @@ def test_a_sensor_that_answers_is_named(
     probed: Probe, turns: list[tuple[str, list[str]]], bitrate: int, found: Answer
 ) -> None:
     assert probed([], turns, bitrate)[1] == [found]
-
-
-@pytest.mark.parametrize("whole", [4, 5])
-def test_five_whole_samples_are_enough(table: Table, whole: int) -> None:
-    turns: list[tuple[str, list[str]]] = [(ATI_SERIAL, [])]
-    with table.can(turns, Stream([STREAM] * whole, 0.02, has_end=False)) as wire:
-        answers = probe_can("can0", interface="socketcan", bitrate=1_000_000, clock=wire.clock)
-    assert [answer.url for answer in answers] == (["robotous-can://can0"] if whole == 5 else [None])

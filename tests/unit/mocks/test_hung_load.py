@@ -11,7 +11,7 @@ from ftmocks.hung_load import HungLoad
 from ftmocks.kinematics import forward
 from ftmocks.ur.robot import Robot
 from ftmocks.workcell import Workcell
-from ftmocks.world import Truth, World
+from ftmocks.world import World
 from tests.unit.mocks.test_world import DH, POSTURE, plain, reach
 
 Array = NDArray[np.float64]
@@ -44,18 +44,6 @@ def test_two_kilograms_hang_from_a_hook(rotation_vector: list[float], wrench: li
     world.hang(2.0, TIP_M, 0.25, 0.0)
     np.testing.assert_allclose(world.true_wrench() - free, wrench, atol=1e-9)
     world.unhang()
-    np.testing.assert_array_equal(world.true_wrench(), free)
-
-
-def test_a_gripped_load_is_a_mass_at_its_place_until_it_is_released() -> None:
-    world = World(Truth.drawn(3), DH, POSTURE)
-    free, verbs = world.true_wrench(), Workcell(world, {}).verbs
-    verbs["hang"]({"mass_kg": 2.0, "at_mm": [60, 0, 120], "swing_deg": 0})
-    as_hung = world.true_wrench()
-    verbs["grip"]({"mass_kg": 2.0, "at_mm": [60, 0, 120]})
-    np.testing.assert_allclose(world.true_wrench(), as_hung, atol=1e-9)
-    assert world.hung is None
-    verbs["unhang"]({})
     np.testing.assert_array_equal(world.true_wrench(), free)
 
 

@@ -105,28 +105,6 @@ def test_the_built_in_sensor_drifts_after_a_start_fastest_at_first() -> None:
     assert drift_N[0] > drift_N[1] - drift_N[0] > (drift_N[3] - drift_N[2]) / 5 > 0
 
 
-def test_the_built_in_sensor_has_the_zeros_and_the_noise_of_a_real_one() -> None:
-    zeros = [TRUTH.with_wrist_sensor(seed) for seed in range(50)]
-    forces, torques = np.array([t.force_bias_N for t in zeros]), np.array([t.torque_bias_Nm for t in zeros])
-    np.testing.assert_allclose(forces.mean(axis=0), [1800, 400, 25400], rtol=0.06)
-    np.testing.assert_allclose(torques.mean(axis=0), [-76, 0, 0], atol=1.5)
-    assert (np.abs(torques[:, 1:]) < 12).all()
-    assert zeros[0].noise_force_N == 0.1
-    assert forces[0].tolist() != forces[1].tolist()
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("", Imperfections()),
-        ("none,ripple=2", replace(IDEAL, ripple=2.0)),
-        ("servo_lag_s=0.01,ring=0", Imperfections(servo_lag_s=0.01, ring=0.0)),
-    ],
-)
-def test_settings_are_read_from_the_command_line(text: str, expected: Imperfections) -> None:
-    assert Imperfections().changed(text) == expected
-
-
 @pytest.mark.parametrize("text", ["ripples=1", "ripple", "ripple=-1", "ring=nan"])
 def test_settings_of_no_cell_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"setting|float"):

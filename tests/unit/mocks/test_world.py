@@ -6,11 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ftmocks.clock import CellClock
-from ftmocks.disturbances import Cable, SensorDrift
 from ftmocks.kinematics import MODELS, Vector6, forward, inverse, matrix_of, vector6
 from ftmocks.world import Truth, World
-from tests.unit.mocks.real_time import RealTime
 
 DH = MODELS["UR5e"]
 POSTURE = vector6(np.radians([45, -100, 60, -50, 90, 45]))
@@ -68,35 +65,3 @@ def test_the_model_of_the_papers_holds_in_any_posture() -> None:
 def test_tilt_turns_gravity_in_base(alpha_deg: float, beta_deg: float, down: list[float]) -> None:
     truth = plain(tilt_alpha_rad=math.radians(alpha_deg), tilt_beta_rad=math.radians(beta_deg))
     np.testing.assert_allclose(truth.gravity_force_base_N, 9.81 * np.array(down), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("beyond_deg", "angle_deg", "degrees"), [(30, 40, 10), (30, 20, 0), (-30, -50, 20), (-30, 0, 0)]
-)
-def test_a_cable_pulls_in_proportion_beyond_an_angle(beyond_deg: float, angle_deg: float, degrees: float) -> None:
-    world = World(plain(), DH, vector6([*POSTURE[:5], math.radians(angle_deg)]))
-    lever = np.array([0.1, 0, 0])
-    world.touch("cable", Cable(np.array([0, 0.2, 0]), lever, joint=5, beyond_rad=math.radians(beyond_deg)))
-    felt = world.contact_wrench()
-    assert np.linalg.norm(felt[:3]) == pytest.approx(0.2 * degrees)
-    np.testing.assert_allclose(felt[3:], np.cross(lever, felt[:3]), atol=1e-12)
-
-
-def test_a_drift_is_linear_and_ends_at_its_total() -> None:
-    real = RealTime()
-    world = World(plain(), DH, POSTURE, clock=CellClock(real))
-    before = world.true_wrench()
-    world.drifts += (SensorDrift(np.array([0.5, 0, 0, 0, 0, 0.02]), world.now_s, 10.0),)
-    for later_s, share in ((0, 0.0), (5, 0.5), (5, 1.0), (50, 1.0)):
-        real.pass_s(later_s)
-        change = world.true_wrench() - before
-        np.testing.assert_allclose(change, [0.5 * share, 0, 0, 0, 0, 0.02 * share], atol=1e-9)
-
-
-def test_a_shifted_payload_is_the_new_truth() -> None:
-    world = World(plain(), DH, POSTURE)
-    before = world.load_wrench()
-    world.shift_payload(2 * world.truth.mass_kg, None)
-    np.testing.assert_allclose(world.load_wrench(), 2 * before)
-    world.shift_payload(None, np.zeros(3))
-    np.testing.assert_allclose(world.load_wrench(), [*(2 * before[:3]), 0, 0, 0], atol=1e-12)

@@ -147,12 +147,6 @@ LBF, LBF_IN = 4.4482216152605, 0.1129848290276167
             (Fact(1e6 / LBF, "configured"), Fact(1e6 / LBF_IN, "configured")),
             False,
         ),
-        (
-            {"unit_codes": (2, 3), "counts_per_unit": (500_000, 1_000_000)},
-            (2.0, 1.0),
-            (Fact(5e5, "configured"), Fact(1e6, "configured")),
-            False,
-        ),
         ({"counts_per_unit": (500_000, 1_000_000)}, (2.0, 1.0), (Fact(5e5, "assumed"), Fact(1e6, "assumed")), True),
     ],
 )

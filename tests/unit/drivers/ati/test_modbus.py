@@ -51,17 +51,6 @@ def block(**change: bytes) -> bytes:
     return bytes(data)
 
 
-def test_calibration_block() -> None:
-    decoded = modbus.decode_calibration_block(block())
-    assert (decoded.serial, decoded.part_number) == ("FT12345", "SI-130-10")
-    assert decoded.matrix.tolist() == np.arange(36.0).reshape(6, 6).tolist()
-    assert decoded.unit_codes == (2, 3)
-    assert decoded.max_rating == (130, 130, 400, 10, 10, 10.5)
-    assert decoded.counts_per_unit == (1_000_000, 2_000_000)
-    assert decoded.gains == (543, 555, 569, 579, 565, 567)
-    assert decoded.offsets == (29000, 30000, 31000, 32000, 33000, 34000)
-
-
 @pytest.mark.parametrize("empty", [bytes(338), b"\xff" * 338, block(_234=bytes(4)), block(_64=b"\x7f\xc0\0\0")])
 def test_an_empty_calibration_is_refused(empty: bytes) -> None:
     with pytest.raises(ProtocolError, match="empty"):

@@ -77,17 +77,6 @@ def test_start_up_on_a_uart_is_golden(table: Table) -> None:
     assert len(samples) == pytest.approx(100, abs=2)
 
 
-@pytest.mark.parametrize(("rate_Hz", "period_s"), [(None, 0.005), (1000, 0.001)])
-def test_can_carries_the_same_commands(table: Table, rate_Hz: int | None, period_s: float) -> None:
-    answers = ANSWERS | (SET_1_KHZ if rate_Hz else {})
-    with table.can(on_can(answers, Stream.of(halves(SAMPLE), period_s))) as wire, bus(wire, rate_Hz) as sensor:
-        samples = sensor.collect(0.15)
-        assert (sensor.health().lost, sensor.health().nominal_rate_Hz) == (0, 1 / period_s)
-    np.testing.assert_allclose(samples.wrench, [WRENCH] * len(samples))
-    assert (np.diff(samples.seq) == 1).all()
-    assert len(samples) == pytest.approx(0.15 / period_s, abs=3)
-
-
 def test_unknown_model_is_refused_with_the_question_to_the_maker(table: Table) -> None:
     answers = {MODEL: b"\x01RFT99-XX01".ljust(16, b"\0")}
     turns = on_uart(answers, Stream.of(b""))

@@ -82,12 +82,6 @@ def test_what_is_out_of_turn_or_short_of_the_clock_is_thrown_away(pattern: str, 
     assert [(first - 2, second - 2) for _, first, second in got] == [(number, number) for number in believed]
 
 
-def test_a_late_host_does_not_pair_what_was_lost() -> None:
-    """It finds `F4 S5` among halves that are not crosswise, as if it had come so."""
-    sent = halves("F2 S2 F3 S3 F4 S5 F6 S6 F7 S7 F8 S8 F9 S9")
-    assert heard(in_step(), sent, [0.0] * 2 + [0.022]) == whole([2, 8, 9])
-
-
 @given(
     loss=st.floats(0, 0.4),
     swaps=st.floats(0, 0.4),

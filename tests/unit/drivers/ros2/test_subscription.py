@@ -17,18 +17,6 @@ def subscribed(graph: Graph, *, reliable: bool = False) -> tuple[str, list[Recei
     return subscribe(cast("Any", graph), TOPIC, KIND, got.append, graph.clock, reliable=reliable), got
 
 
-def test_a_topic_without_publisher_is_awaited_and_others_of_its_type_are_named(graph: Graph) -> None:
-    with pytest.raises(ConnectError, match=r"no node publishes /ft/wrench \(.*\); no topic has this type"):
-        subscribed(graph)
-    assert graph.clock.now_s() == pytest.approx(1003.0, abs=0.06)
-    graph.add("/left/wrench", KIND)
-    graph.add("/right/wrench", KIND)
-    graph.add("/arm/pose", "geometry_msgs/msg/PoseStamped")
-    graph.publishers[TOPIC] = []  # as one that has left
-    with pytest.raises(ConnectError, match=r"; topics of this type: /left/wrench, /right/wrench; "):
-        subscribed(graph)
-
-
 def test_names_and_a_second_publisher_are_awaited(graph: Graph) -> None:
     graph.clock.at(1.0, lambda: graph.add(TOPIC, KIND, "_NODE_NAME_UNKNOWN_"))
     graph.clock.at(1.3, graph.publishers.clear)

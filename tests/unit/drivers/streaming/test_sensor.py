@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -31,7 +31,6 @@ class Fed(StreamingSensor):
         self.disconnect_error: Exception | None = None
         self.connects = self.disconnects = 0
         self.info = DeviceInfo("fake", "F1", "1.0")
-        self.before_read: Callable[[], object] = lambda: None
         self.first = 1
         self.seq = 0
         self.arrived = threading.Condition()
@@ -45,7 +44,6 @@ class Fed(StreamingSensor):
         return self.info
 
     def _read_block(self) -> FtSamples:
-        self.before_read()
         with self.arrived:
             for left_s in self._clock.looks(READ_S):
                 if self.feed:
@@ -312,19 +310,6 @@ def readers() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if "fake" in thread.name]
 
 
-def test_what_came_twice_or_too_late_is_dropped_and_counted(sensor: FakeSensor) -> None:
-    sensor.at(0.02, *(block_now(sensor, seq) for seq in ([5, 5, 6], [6, 9, 7, 10], [8])))
-    sensor.at(0.08, block_now(sensor, [11], 0.08))
-    samples = sensor.collect(0.06)
-    health = sensor.health()
-    assert samples.seq.tolist() == [5, 6, 9, 10]
-    assert (health.duplicated, health.out_of_order) == (2, 2)
-
-
-def block_now(sensor: FakeSensor, seq: list[int], after_s: float = 0.02) -> FtSamples:
-    return sensor.block(seq, after_s=after_s)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_wrench_that_is_no_number_is_never_delivered(sensor: FakeSensor, bad: float) -> None:
     sensor.feed.append(sensor.block([5, 6], wrench=bad))
@@ -411,18 +396,6 @@ class TestAway:
         health = sensor.health()
         assert health.lost == pytest.approx(1 + 200 + 5, abs=1)  # the first read to wait after 50 ms ends it
         assert health.received == sensor.seq - health.lost
-
-    def test_a_stream_that_never_has_to_be_waited_for_is_believed_after_half_a_second(self, sensor: FakeSensor) -> None:
-        def send() -> None:
-            sensor.feed.append(1)
-            sensor.time.ns += 400_000
-
-        sensor.before_read = send
-        start_s = sensor.time.now_s()
-        sensor.time.stall(1.0)
-        while sensor.health().received == 1:
-            sensor.time.advance(0.001)
-        assert sensor.time.now_s() - start_s == pytest.approx(1.5, abs=0.01)
 
     def test_a_sensor_has_time_before_it_is_connected_again(self) -> None:
         with FakeSensor(recover=True) as sensor:

@@ -445,6 +445,3 @@ def test_an_old_attempt_to_stop_does_not_end_the_next_move(
     move(arm, controller)
     clock.advance(1.0)
     assert "dashboard stop" not in controller.did
-
-
-# ---------------------------------------------------------------------- an emulated cell

@@ -268,21 +268,6 @@ def test_a_follower_finds_silence_as_quickly_as_a_look(
             follow.read(0.0)
 
 
-def test_the_end_of_the_stream_is_raised_at_a_follower(
-    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
-) -> None:
-    with full_rate.follow() as follow:
-        clock.advance(0.004)
-        controller.failure = ConnectionResetError("reset")
-        clock.advance(0.004)
-        assert len(follow.read(0.1)) == 2
-        for _ in range(2):
-            with pytest.raises(StreamBroken, match="reset"):
-                follow.read(0.1)
-    with pytest.raises(StreamBroken, match="reset"), full_rate.follow():
-        pytest.fail("a stream that has failed was followed")
-
-
 # ---------------------------------------------------------------------- who it is
 
 

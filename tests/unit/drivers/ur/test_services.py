@@ -128,11 +128,6 @@ def test_a_robot_api_answers() -> None:
     assert asked[-1] == ("PUT", "/program/v1/state", {"action": "stop"})
 
 
-def test_an_early_robot_api_does_not_know_everything() -> None:
-    with an_api({("GET", "/program/v1/state"): (200, {"state": "STOPPED"})}) as (port, _):
-        assert ask(VX, everything, port) == (None, None, None, "STOPPED", None)
-
-
 @pytest.mark.parametrize(
     ("status", "answer", "says"),
     [(403, {"message": "Forbidden"}, "status 403.*Forbidden"), (200, b"<html>", "not JSON"), (500, {}, "status 500")],

@@ -1,37 +1,12 @@
 """The settings of the station's sensors."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from ftmocks.__main__ import _parser
 from ftmocks.sensor_errors import PERFECT, SensorErrors
 from ftmocks.sensors.catalogue import parse_settings
-from ftmocks.sensors.robotous import MODELS
 from ftmocks.station import truth_from
-
-
-@pytest.mark.parametrize(
-    ("name", "settings", "options"),
-    [
-        ("can", [], {}),
-        ("none", [], {}),
-        (
-            "robotous-can",
-            ["model=RFT64-6A01", "ids=0xF0,0xF1,242"],
-            {"model": MODELS["RFT64-6A01"], "ids": (0xF0, 0xF1, 0xF2)},
-        ),
-        ("bota", ["baud=230400", "boot-s=0.5"], {"baud_code": 3, "boot_s": 0.5}),
-        (
-            "netft",
-            ["tool-transform=0,0,0,0,0,90", "bias=0,0,0,0,0,0"],
-            {"tool_transform": [0, 0, 0, 0, 0, 90], "bias": [0] * 6},
-        ),
-    ],
-)
-def test_settings(name: str, settings: list[str], options: dict[str, Any]) -> None:
-    assert parse_settings(name, settings) == options
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-import pytest
 
 from ftmocks.sensors.robotiq_urcap import RobotiqUrcap
 
@@ -40,36 +39,3 @@ def test_every_client_receives_readings_in_the_resolution_of_the_sensor() -> Non
             assert received(client, 3 * len(TEXT)) == 3 * TEXT, "without anything between"
         clients[0].close()
         assert received(clients[1], 20 * len(TEXT)) == 20 * TEXT
-
-
-class Slow(socket.socket):
-    """A client whose buffer has room for so many bytes."""
-
-    def __init__(self, room: int) -> None:
-        super().__init__()
-        self.room, self.data = room, b""
-
-    def send(self, data: bytes, *_: int) -> int:  # type: ignore[override]
-        if not self.room:
-            raise BlockingIOError
-        sent = data[: self.room]
-        self.room -= len(sent)
-        self.data += sent
-        return len(sent)
-
-
-class Box(RobotiqUrcap):
-    def deliver(self, client: socket.socket, count: int) -> None:
-        self._clients.setdefault(client, b"")
-        self._deliver([TEXT] * count)
-
-
-@pytest.mark.parametrize("room", [0, 30, len(TEXT) + 5])
-def test_a_client_that_does_not_read_loses_whole_readings(room: int) -> None:
-    box = Box(lambda n: np.tile(WRENCH, (n, 1)))
-    with Slow(room) as client:
-        box.deliver(client, 5)
-        client.room = 1000
-        box.deliver(client, 2)
-        assert client.data == TEXT * (client.data.count(b"(")), "no reading is broken"
-        assert client.data.endswith(2 * TEXT)

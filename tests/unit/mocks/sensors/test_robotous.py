@@ -106,18 +106,6 @@ def test_can_node_answers_at_its_identifiers(readings: Readings) -> None:
     assert node.answer(CanFrame(0x70, command("0A"))) == [CanFrame(0x71, sample[:8]), CanFrame(0x72, sample[8:])]
 
 
-def test_while_streaming_only_stop_and_bias_are_taken(sensor: RobotousSerialBox) -> None:
-    sensor.execute(command("0B"))
-    for code in range(0x14):
-        if code != 0x0C:
-            assert sensor.execute(bytes([code, 1]).ljust(8, b"\0")) == []
-    assert sensor.streaming
-    assert sensor.rate_code == 0
-    assert sensor.samples(1)[0][1:13] == bytes(12), "the bias was taken"
-    sensor.execute(command("0C"))
-    assert not sensor.streaming
-
-
 @pytest.mark.parametrize("axis", [0, 5])
 def test_overload_bits_and_counts(sensor: RobotousSensor[bytes], readings: Readings, axis: int) -> None:
     unloaded = WRENCH * (np.arange(6) != axis)

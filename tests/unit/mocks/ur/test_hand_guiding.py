@@ -61,14 +61,6 @@ def test_a_hand_turns_the_wrist_to_all_turns_of_a_cube_and_begins_again() -> Non
     assert len({tuple(row) for row in down.round().astype(int).tolist()}) == 6  # soon it has pulled along every axis
 
 
-def test_a_tool_with_a_hanging_load_points_down_or_is_tilted() -> None:
-    robot = new_robot()
-    robot.world.hang(2.0, np.array([0.0, 0.0, 0.2]), 0.25, 0.0)
-    axes = np.array([flange(q)[:, 2] for q in orientations(robot)])
-    assert set(np.degrees(np.arccos(-axes[:, 2])).round()) == {0, 60}
-    assert np.abs(axes[:, :2].sum(axis=0)).max() < 1e-6, "to all sides"
-
-
 def test_a_program_on_the_pendant_goes_there_once_and_back() -> None:
     robot = new_robot()
     assert start_upload(robot, pendant_program(robot, REST_S))

@@ -110,13 +110,6 @@ def contact(robot: Robot) -> None:
     robot.world.touch("push", Push(np.array([0.0, 0.0, 30.0, 0.0, 0.0, 0.0])))
 
 
-def input_on(place: int) -> Callable[[Robot], None]:
-    def set_it(robot: Robot) -> None:
-        robot.signals.inputs |= 1 << place
-
-    return set_it
-
-
 class Saved(NamedTuple):
     """A program, what the operator does 0.6 s after its start, and what becomes of it."""
 
@@ -236,40 +229,6 @@ PROGRAMS = [
   textmsg(moved < 0.03)""",
         ["True", "True"],
         meanwhile=contact,
-    ),
-    Saved(
-        "choice that is checked continuously",
-        "5",
-        """global ready=True
-  global thread_flag_4=0
-  while (True):
-    $ 4 "If ready"
-    global thread_flag_4=0
-    thread Thread_if_4():
-      $ 5 "Wait: 100.0"
-      sleep(100.0)
-      global thread_flag_4=1
-      while (True):
-        sync()
-      end
-      return False
-    end
-    if (ready):
-      global thread_handler_4=run Thread_if_4()
-      while (thread_flag_4 == 0):
-        if not(get_configurable_digital_in(1) == False):
-          kill thread_handler_4
-          global thread_flag_4=2
-        end
-        sync()
-      end
-      kill thread_handler_4
-    end
-    textmsg(thread_flag_4)
-    break
-  end""",
-        ["2"],
-        meanwhile=input_on(9),
     ),
     Saved(
         "move of PolyScope X",

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from ftmocks.ur import api, http_wire
+from ftmocks.ur import api
 from ftmocks.ur.modes import RobotMode, Runtime, SafetyMode
 from ftmocks.ur.robot import Robot
 from tests.unit.mocks.ur.urscript_robot import new_robot, start
@@ -81,24 +81,3 @@ def test_other_methods_and_paths_are_rejected() -> None:
     assert api.respond(robot, "DELETE", api.BASE + "/program/v1/state", b"")[0] == 405
     assert api.respond(robot, "GET", api.BASE + "/robotstate/v1/state", b"")[0] == 405
     assert api.respond(robot, "GET", "/program/v1/state", b"")[0] == 404
-
-
-def test_requests_are_taken_whole_and_in_order() -> None:
-    stream = (
-        b"PUT /a HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\n\r\n{}GET /b?c=1 HTTP/1.1\r\nConnection: close\r\n\r\n"
-    )
-    buffer, taken = bytearray(), []
-    for byte in stream:
-        buffer.append(byte)
-        if request := http_wire.take_request(buffer):
-            taken.append(request)
-    assert taken == [("PUT", "/a", b"{}", False), ("GET", "/b?c=1", b"", True)]
-    assert buffer == b""
-
-
-@pytest.mark.parametrize(
-    "head", [b"hello\r\n\r\n", b"GET / HTTP/2\r\n\r\n", b"PUT / HTTP/1.1\r\nContent-Length: -1\r\n\r\n", b"x" * 70000]
-)
-def test_what_is_no_request_is_rejected(head: bytes) -> None:
-    with pytest.raises(http_wire.HttpError):
-        http_wire.take_request(bytearray(head))

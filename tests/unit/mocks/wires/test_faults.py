@@ -1,8 +1,11 @@
-"""What goes wrong between a sensor and its client: probabilities, and delays in the cell's time."""
+"""What goes wrong between a sensor and its client: certain faults, foreign frames, and marks of wrong parity."""
+
+import pytest
 
 from ftmocks.clock import CellClock
 from ftmocks.wires.faults import Faults, FaultyWire
 from ftmocks.wires.slcan import CanFrame
+from ftmocks.wires.uart import WrongParity, marked
 from tests.unit.mocks.real_time import RealTime
 
 CLOCK = CellClock(RealTime())
@@ -39,3 +42,17 @@ def test_foreign_frames_precede_and_can_frames_stay_whole() -> None:
     wire.foreign = lambda _rng: alien
     wire.put([own, own])
     assert wire.due(LATER_S) == [alien, own, alien, own]
+
+
+@pytest.mark.parametrize(
+    ("data", "wire"),
+    [
+        (b"", ""),
+        (b"a\xff\0b", "61 FF FF 00 62"),
+        (WrongParity(b"abc", 1), "61 FF 00 62 63"),
+        (WrongParity(b"\xffa\xff", 2), "FF FF 61 FF 00 FF"),
+        (WrongParity(b"\0\0", 0), "FF 00 00 00"),
+    ],
+)
+def test_marks_of_posix(data: bytes, wire: str) -> None:
+    assert marked(data) == bytes.fromhex(wire)
