@@ -180,8 +180,8 @@ def test_bota_too_slow_is_a_warning(start: Start, caplog: pytest.LogCaptureFixtu
     ("options", "query"),
     [
         ({"baud_code": 1}, "baud=57600"),
-        pytest.param({"baud_code": 3}, "sinc=256", marks=pytest.mark.slow),
-        pytest.param({"boot_s": 1}, "", marks=pytest.mark.slow),
+        pytest.param({"baud_code": 3, "boot_s": 1}, "", marks=pytest.mark.slow),
+        pytest.param({}, "sinc=256", marks=pytest.mark.slow),
     ],
 )
 def test_bota_is_found_at_its_baud_rate_while_it_boots(start: Start, options: dict[str, Any], query: str) -> None:
