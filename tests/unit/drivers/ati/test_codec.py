@@ -1,8 +1,17 @@
 """NETCANOEM frames that the dialogue of test_can_driver.py does not show."""
 
+import struct
+
 import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ftdrivers.ati import codec
+from ftdrivers.errors import ProtocolError
+from ftdrivers.wires.framing import describe_status
+
+i16 = st.integers(-32768, 32767)
 
 
 def test_capture_of_a_real_unit() -> None:
@@ -28,3 +37,33 @@ def test_identity_and_units() -> None:
     assert firmware == (3, 8, 2)
     assert firmware >= codec.COUNTS_PER_UNIT_SINCE
     assert codec.Firmware(3, 7, 0) >= codec.COUNTS_PER_UNIT_SINCE > codec.Firmware(3, 6, 99)
+
+
+def test_status_in_words() -> None:
+    assert describe_status(0, codec.STATUS_BITS) == "0x0000 (ok)"
+    assert describe_status(0x8040, codec.STATUS_BITS) == (
+        "0x8040 (bit 6: no valid calibration in the active slot, bit 15: any error)"
+    )
+    critical = {bit for bit in range(16) if codec.CRITICAL >> bit & 1}
+    assert critical == {1, 2, 3, 4, 5, 6, 7, 11, 12}
+
+
+@pytest.mark.parametrize("bad", ["7FC00000", "7F800000", "FF800000"])
+def test_a_matrix_that_is_not_finite_is_refused(bad: str) -> None:
+    with pytest.raises(ProtocolError, match="not finite"):
+        codec.decode_matrix_row(bytes(8), bytes(4) + bytes.fromhex(bad), bytes(8))
+
+
+@given(st.integers(0, 0xFFFF), st.tuples(i16, i16, i16, i16, i16, i16))
+def test_gauges_round_trip(status: int, gauges: tuple[int, ...]) -> None:
+    first = struct.pack(">H3h", status, *gauges[0::2])
+    second = struct.pack(">3h", *gauges[1::2])
+    reading = codec.decode_gauges(first, second)
+    assert reading.status == status
+    assert tuple(reading.gauges) == gauges
+
+
+@given(st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), min_size=6, max_size=6))
+def test_matrix_row_round_trip(row: list[float]) -> None:
+    data = struct.pack(">6f", *row)
+    assert codec.decode_matrix_row(data[:8], data[8:16], data[16:]).tolist() == row

@@ -445,3 +445,22 @@ def test_an_old_attempt_to_stop_does_not_end_the_next_move(
     move(arm, controller)
     clock.advance(1.0)
     assert "dashboard stop" not in controller.did
+
+
+@pytest.mark.parametrize(("stop_deg_s2", "is_allowed"), [(59.5, False), (60, True), (300, True), (300.5, False)])
+def test_a_stop_has_a_usual_deceleration(stop_deg_s2: float, is_allowed: bool) -> None:
+    with nullcontext() if is_allowed else pytest.raises(ValueError, match=r"choose 1\.05 to 5\.23"):
+        UrArm(HOST, stop_rad_s2=radians(stop_deg_s2))
+
+
+@on_ur_rtde
+@pytest.mark.parametrize(("answers_in_s", "ours"), [(0.38, True), (0.42, False)])
+def test_a_question_to_our_program_has_four_tenths_of_a_second(
+    arm: UrArm, controller: Controller, clock: FakeClock, answers_in_s: float, ours: bool
+) -> None:
+    controller.control_delay_s = answers_in_s
+    begin_s = clock.now_s()
+    with nullcontext() if ours else pytest.raises(DeviceFault, match="another program"):
+        move(arm, controller)
+    assert ours or 0.4 <= clock.now_s() - begin_s < 0.43
+    assert controller.control.alive == ours

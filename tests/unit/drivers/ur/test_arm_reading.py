@@ -13,6 +13,7 @@ from ftdrivers.interfaces import ArmStates
 from ftdrivers.ur.kinematics import MODELS, Kinematics, forward
 from ftdrivers.ur.reading import Reader
 from ftdrivers.ur.sample import Sample
+from ftdrivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
 from tests.own_kinematics import drawn, real
 from tests.unit.drivers.ur.controller_in_memory import (
@@ -353,3 +354,24 @@ def test_numbers_have_the_names_of_the_rtde_guide(reader: Reader) -> None:
         assert replace(sample, program_state=number).status().program.startswith(words)
     for number, words in rows(SAFETY_BITS):
         assert str(replace(sample, safety_bits=1 | 1 << number).safety_fault()).startswith(f"{words} (safety status")
+
+
+def test_a_status_is_at_most_fifty_milliseconds_old(controller: Controller, reader: Reader, clock: FakeClock) -> None:
+    reader.look()
+    controller.silent = True
+    clock.advance(0.049)
+    reader.status()
+    clock.advance(0.002)
+    assert wait_s(clock, reader.status, DeviceTimeout) == pytest.approx(STRICT.stale_s, abs=1e-6)
+
+
+def test_a_shorter_silence_is_none(controller: Controller, reader: Reader, clock: FakeClock) -> None:
+    reader.look()
+    controller.silent = True
+
+    def speak() -> None:
+        controller.silent = False
+
+    clock.at(0.18, speak)  # the sample after the silence came without being waited for, as far as anybody knows
+    reader.look()
+    assert not reader.silent

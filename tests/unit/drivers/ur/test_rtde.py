@@ -7,6 +7,8 @@ from contextlib import closing, contextmanager, suppress
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken, Unreachable
 from ftdrivers.ur import rtde
@@ -213,3 +215,15 @@ def test_each_reason_for_no_connection_has_its_own_fix(
     with pytest.raises(Unreachable) as raised:
         rtde.Subscription("ur5", OUTPUTS, 125.0, timeout_s=0.5)
     assert fix in raised.value.fix
+
+
+@given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=80)), max_size=6), st.integers(1, 40))
+def test_packages_survive_any_cut_of_the_stream(packages: list[tuple[int, bytes]], step: int) -> None:
+    stream = b"".join(rtde.encode(kind, payload) for kind, payload in packages)
+    buffer, found = bytearray(), []
+    for at in range(0, len(stream), step):
+        buffer += stream[at : at + step]
+        while (package := rtde.take_package(buffer)) is not None:
+            found.append(package)
+    assert found == packages
+    assert not buffer

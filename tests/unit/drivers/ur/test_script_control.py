@@ -13,6 +13,7 @@ from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import ControlSetting
 from ftdrivers.ur.primary import Code, Failed, Note, Stopped
 from ftdrivers.ur.script_control import OUTPUTS, STOPS_ITSELF_S, program_text
+from ftdrivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, MakeArm, away, no_guard
 from tests.unit.drivers.ur.program_in_memory import Script
@@ -219,3 +220,56 @@ def test_a_sweep_from_elsewhere_is_rejected(arm: UrArm, controller: Controller) 
     sweep = replace(sweep_of(arm), centre_rad=away(controller))
     with pytest.raises(DeviceFault, match="rejected the sweep"):
         arm.sweep(sweep, guard=no_guard)
+
+
+@pytest.mark.usefixtures("arm")
+def test_every_sample_is_answered_with_one_heartbeat(script: Script, clock: FakeClock) -> None:
+    beats: list[float] = []
+    for _ in range(20):
+        clock.advance(CYCLE_S)
+        beats.append(script.registers.inputs[0])
+    assert len(set(beats)) == 20
+    script.link.sent.clear()
+    script.registers.far.silent = True
+    before = script.registers.inputs[0]
+    clock.advance(0.1)
+    assert script.registers.inputs[0] == before
+
+
+def test_the_error_of_another_program_is_not_ours(
+    arm: UrArm, script: Script, controller: Controller, clock: FakeClock
+) -> None:
+    script.messages += [Failed(3, 1, "syntax_error_on_line:3:"), Stopped("other")]
+    clock.advance(0.1)
+    clock.at(0.3, lambda: setattr(controller, "program", 1))
+    with pytest.raises(DeviceFault, match="ended by itself or was stopped from outside"):
+        arm.move_to(away(controller), timeout_s=5, guard=no_guard)
+
+
+@pytest.mark.parametrize("how", ["suspended", "cut"])
+def test_a_sweep_without_heartbeat_stops(
+    arm: UrArm, script: Script, controller: Controller, clock: FakeClock, how: str
+) -> None:
+    control, sweep = controller.control, sweep_of(arm)
+    for k, wave in enumerate(sweep.waves.reshape(-1, 3).tolist()):
+        control.call("wave", k, *wave)
+    control.call("sweep", list(sweep.centre_rad), sweep.duration_s, sweep.ramp_s)
+    clock.advance(0.3)
+    assert controller.goal_rad is not None
+    if how == "cut":
+        script.link.cut = True
+    else:
+        control.suspended = True
+    clock.advance(STOPS_ITSELF_S)
+    assert controller.goal_rad is None
+    assert script.registers.outputs[1] == -2
+
+
+@pytest.mark.usefixtures("arm")
+def test_a_silent_controller_is_lost_after_its_limit_and_not_before(controller: Controller, clock: FakeClock) -> None:
+    controller.silent = True
+    clock.advance(STRICT.stale_s - 3 * CYCLE_S)
+    assert controller.control.alive
+    clock.advance(3 * CYCLE_S)
+    assert not controller.control.alive
+    assert "the controller sent nothing for" in str(controller.control.end_reason())

@@ -21,6 +21,16 @@ def frame(body: bytes) -> bytes:
     return b"AB" + body + bytes([sum(body) & 0xFF])
 
 
+@given(st.lists(st.binary(min_size=3, max_size=3), max_size=10), st.integers(1, 20))
+def test_every_frame_survives_any_cut_of_the_stream(bodies: list[bytes], step: int) -> None:
+    stream = b"".join(map(frame, bodies))
+    frames, found = deframer(), []
+    for at in range(0, len(stream), step):
+        found += frames.feed(stream[at : at + step])
+    assert found == list(enumerate(map(frame, bodies), start=1))
+    assert frames.damaged == 0
+
+
 @given(st.lists(st.binary(max_size=30), max_size=10))
 def test_any_bytes_are_taken_and_only_intact_frames_come_out(chunks: list[bytes]) -> None:
     frames = deframer()
@@ -33,6 +43,26 @@ def test_a_false_header_costs_no_frame() -> None:
     inside = frame(b"xAB")  # the header occurs in the data
     frames = deframer()
     assert frames.feed(inside[3:] + inside + inside) == [(1, inside), (2, inside)]
+
+
+@pytest.mark.parametrize(
+    ("data", "arrived", "has_noise"),
+    [
+        (b"", "no bytes arrived", False),
+        (b"A", "bytes arrived, but no frames of 6 bytes", True),
+        (b"?" * 30, "bytes arrived, but no frames of 6 bytes", True),
+        (b"?" + frame(b"abc") + b"?" * 6 + frame(b"abc"), "2 frames arrived", False),
+    ],
+)
+def test_what_has_arrived_is_described(data: bytes, arrived: str, has_noise: bool) -> None:
+    frames = deframer()
+    frames.feed(data)
+    assert (frames.arrived, frames.has_noise) == (arrived, has_noise)
+
+
+def test_a_header_of_one_byte_may_stand_before_that_of_a_frame() -> None:
+    frames, good = Deframer(b"A", 4, lambda frame: sum(frame[1:3]) & 0xFF == frame[3]), b"A\x01\x02\x03"
+    assert frames.feed(b"A" + good + b"AA" + good) == [(1, good), (3, good)]
 
 
 @pytest.mark.parametrize(
