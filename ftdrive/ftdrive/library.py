@@ -472,8 +472,8 @@ def solve_load_runs(
 ) -> tuple[LoadSolution, SensorMatrix]:
     """Fit the matrix of a sensor to runs with the tool alone and with loads; return the solution and the prior matrix.
 
-    `tool_mass` is the weighed mass, such as "1.300±0.002"; default: that of the cells. `say` receives the source of the
-    prior. Raises `ConfigError` for runs of different sensors, and as `read_source`.
+    `tool_mass` is the weighed mass, such as "1.300±0.002"; by default, the one in the configuration of the cells. `say`
+    receives the source of the prior. Raises `ConfigError` if the sensors differ, and whatever `read_source` raises.
     """
     read = [_run_of(path) for path in paths]
     identity, data = read[0][1:]

@@ -130,7 +130,7 @@ def _parser() -> argparse.ArgumentParser:
         "--kinematics",
         default="drawn",
         metavar="drawn|ideal|FILE.json",
-        help="factory calibration: drawn with the spread of real arms (default), none, or model, theta, a, d, alpha",
+        help="factory calibration: random as in real arms, none, or from a file with model, theta, a, d, alpha",
     )
     add(
         "--kinematics-message",

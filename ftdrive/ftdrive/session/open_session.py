@@ -213,12 +213,12 @@ class Journal:
         return self._operator.has_keys
 
     def pressed(self) -> Key | None:
-        """Return the newest key pressed; None if there is none."""
+        """Return the last key pressed; None if there is none."""
         return self._operator.pressed()
 
     @property
     def pressed_by(self) -> str:
-        """Return who pressed the newest key."""
+        """Return who pressed the last key."""
         return self._operator.pressed_by
 
 

@@ -143,7 +143,7 @@ class FreeToolPrediction(Guard):
     """Recursive least-squares fit of the wrench as a linear function of the gravity direction in flange axes.
 
     Force and torque of a free tool are linear in this direction for every mounting, weight, centre of mass and bias.
-    The class is a guard that never trips: it learns from each look and predicts the wrench for the contact guard.
+    As a guard that never trips, the class receives each sample, updates the fit, and predicts for the contact guard.
     """
 
     down_base: Array

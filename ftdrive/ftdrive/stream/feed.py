@@ -57,8 +57,8 @@ class FeedNote:
 class Feed(Sink):
     """Passes the blocks and events of a stream to the screen and the page, and never waits for them.
 
-    Requests of screen and page are carried out between two reads, so that only one thread uses the stream. `recorder`
-    opens a recording in a new file, and `push` pushes the tool of an emulated cell.
+    Requests from the screen and the page are carried out between two reads, so only one thread uses the stream.
+    `recorder` opens a recording in a new file, and `push` pushes the tool of an emulated cell.
     """
 
     label = "screen"

@@ -303,7 +303,7 @@ class CellSource(SampleSource):
         texts = {} if self._failure is None else {self._failure[0]: str(self._failure[1])}
         error = texts.get("sensor", "")
         sensor = LinkStatus(health.rate_Hz, self.info.sensor_rate_Hz, health.lost, health.age_s, error)
-        # a missing arm has the age 0
+        # without an arm, the age is 0
         arm = LinkStatus(0.0, 0.0, 0, 0.0)
         if self._arm is not None:
             now_ns = self.clock.now_ns()

@@ -338,7 +338,7 @@ class Screen:
         return Live(console=self._console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
 
     def _answer(self, question: Question) -> str:
-        """Ask until there is an answer, then erase question and frame, where the next frame is drawn."""
+        """Ask until there is an answer, then erase the question and the frame, so the next frame takes their place."""
         used = len(self._frame().renderables)
         while True:
             width = self._console.width

@@ -61,7 +61,7 @@ class Page:
         self.on("stop", lambda viewer, _: stop(viewer))
 
     def act(self, viewer: str, name: object, value: object) -> None:
-        """Use a control for a viewer. Raises `ValueError` if the control is not visible or the value is invalid."""
+        """Operate a control for a viewer. Raises `ValueError` if it is not visible, or the value is invalid."""
         with self._lock:
             shown = [part["controls"] for part, _, _ in self._parts.values() if part and part["kind"] == "controls"]
         found = next((one for part in shown for one in part if one["name"] == name and not one.get("disabled")), None)

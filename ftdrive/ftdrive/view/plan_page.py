@@ -82,7 +82,7 @@ class PlanPage:
                 self._chosen[name] = not self._chosen["play"] if name == "play" else value
 
     def draw(self) -> None:
-        """Show changes to browsers."""
+        """Send the changes to the browsers."""
         with self._lock:
             chosen = dict(self._chosen)
         if chosen == self._drawn:
