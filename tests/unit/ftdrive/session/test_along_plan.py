@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.planning.approach import plan_approach
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour, speeds_of
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
 from ftdrive.session.drive import APPROACH_RAD_S, SLOW
 from ftdrive.session.tour import moves_s
 
@@ -33,15 +32,3 @@ def test_the_rest_of_a_tour_counts_what_is_left_and_the_ways_past_what_is_not(ce
     past = np.abs(np.subtract(plan.steps[8].q_rad, plan.steps[2].q_rad)).max()
     expected_s = float(move_duration_s(past, APPROACH_RAD_S, SLOW.joint_rad_s2))
     assert moves_s(plan, [3, 9], there) - moves_s(plan, [3], there) == pytest.approx(expected_s)
-
-
-def test_limits_in_force_slow_a_plan_down_and_never_speed_it_up(certifier: Certifier, plan: Plan) -> None:
-    slow = plan.limited(certifier, Speeds(0.2, 0.3, 0.1))
-    assert max(step.speed_rad_s for step in slow.steps) <= 0.2
-    assert slow.acceleration_rad_s2 == 0.3
-    assert slow.limited(certifier, Speeds()) == slow
-
-
-def test_not_even_the_settings_of_an_old_run_go_faster_than_allowed() -> None:
-    robot = RobotConfig("fake", speed_deg_s=180.0, acceleration_deg_s2=80.0, tip_speed_mm_s=1000.0)
-    assert speeds_of(CellConfig(robot, SensorConfig("fake://"))) == Speeds()

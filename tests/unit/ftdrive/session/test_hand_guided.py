@@ -295,30 +295,6 @@ def test_every_standstill_at_a_new_orientation_is_a_pose() -> None:
     assert np.abs(result.force_bias_N - BIAS[:3]).max() < 4 * np.max(result.sigma["force_bias_N"])
 
 
-def test_a_verification_ends_with_the_last_pose_however_far_from_the_prediction() -> None:
-    more = Rotation.from_euler("xyz", (40, 30, 0), degrees=True)
-    outcome = Outcome(dwells(*AROUND, more, UP * more), fit=Verification(), has_keys=False)
-    assert outcome.stops == [1, 2, 3, 4, 5, 6, 7]
-    assert "touched" not in outcome.person.words()
-
-
-def test_a_pose_is_on_disk_before_it_is_reported() -> None:
-    shown = Outcome(dwells(UP, DOWN)).person.shown
-    kinds = [
-        event.words if isinstance(event, Noted) else event.state.value if isinstance(event, StateChanged) else "pose"
-        for event in shown
-        if not isinstance(event, Estimated)
-    ]
-    one = ["settle", "sample", "committed 1", "pose", "move"]
-    assert kinds[1:-1] == ["move", *one, *(words.replace("1", "2") for words in one)]
-    taken = next(event for event in shown if isinstance(event, PoseTaken))
-    np.testing.assert_allclose(taken.gravity_flange, [0, 0, -1])
-    assert 1.0 <= taken.settle_s < 1.15
-    assert taken.attempts == 1
-    estimates = [event for event in shown if isinstance(event, Estimated)]
-    assert [event.hint for event in estimates] == ["point it down"] * 2
-
-
 def test_an_arm_that_hardly_rests_or_creeps_is_not_measured() -> None:
     outcome = Outcome([Dwell(UP, 0.9), Dwell(LEFT, 30, creep_rad_s=0.0019), Dwell(DOWN, 0.5), Dwell(FRONT)])
     assert outcome.stops == [1]
@@ -331,17 +307,12 @@ def test_if_the_arm_moves_off_while_measured_the_time_to_wait_is_shown() -> None
     assert "moved while pose 1" in outcome.person.words()
 
 
-@pytest.mark.parametrize("turn_deg", [2.0, 9.0])
-def test_a_repeat_is_reported_once_and_left_out(turn_deg: float) -> None:
-    near = Rotation.from_euler("y", turn_deg, degrees=True)
+def test_a_repeat_is_reported_once_and_left_out() -> None:
+    near = Rotation.from_euler("y", 9.0, degrees=True)
     nudged = near * Rotation.from_euler("x", 0.5, degrees=True)
     outcome = Outcome(dwells(UP, DOWN, near, nudged, LEFT))
     assert outcome.stops == [1, 2, 3]
-    assert outcome.person.words().count(f"This orientation is {turn_deg:.0f}° from pose 1") == 1
-
-
-def test_a_quarter_turn_about_gravity_is_no_repeat() -> None:
-    assert Outcome(dwells(UP, Rotation.from_euler("z", 90, degrees=True))).stops == [1, 2]
+    assert outcome.person.words().count("This orientation is 9° from pose 1") == 1
 
 
 def test_keep_ends_it_when_the_poses_are_enough_and_not_before() -> None:
@@ -357,15 +328,6 @@ def test_keep_ends_it_when_the_poses_are_enough_and_not_before() -> None:
     assert outcome.cell.now_s == pytest.approx(32.0, abs=0.2)
 
 
-def test_stop_ends_it_at_any_time_and_says_what_is_missing() -> None:
-    outcome = Outcome(dwells(UP, DOWN), keys={5.0: Key.STOP})
-    last = outcome.person.shown[-1]
-    assert isinstance(last, Noted)
-    assert last.warning
-    assert last.words.startswith("Stopped by the operator: 1 pose is saved")
-    assert "amber" in last.words
-
-
 TILTED = [Rotation.from_euler("xyz", angles, degrees=True) for angles in ((45, 0, 0), (0, 45, 0))]
 
 
@@ -375,34 +337,6 @@ def test_without_keys_it_ends_by_itself_when_the_poses_are_enough() -> None:
     assert "when the coverage is green" in outcome.person.words()
     assert "6 poses are saved." in outcome.person.words()
     assert "press" not in outcome.person.words()
-
-
-def test_without_keys_it_does_not_end_with_a_pose_that_is_in_doubt() -> None:
-    def shaken(t: Array) -> Array:
-        return np.outer(np.sin(40 * t), [8, 0, 0, 0, 0, 0])
-
-    poses = dwells(*AROUND, *TILTED)
-    poses[5] = Dwell(AROUND[5], 12.0, wrench=shaken)
-    outcome = Outcome(poses, has_keys=False)
-    assert [record.steady for record in outcome.kept] == [True] * 5 + [False, True]
-    assert "The pose is saved and marked as not quiet." in outcome.person.words()
-    assert "press" not in outcome.person.words()
-
-
-def test_redo_replaces_the_newest_pose_where_the_arm_stands_or_goes() -> None:
-    there = Outcome(dwells(UP, DOWN, LEFT, seconds=8.0), keys={14.5: Key.REDO})
-    assert there.stops == [1, 2, 2, 3]
-    np.testing.assert_array_equal(there.kept[1].before.R_base_flange, there.kept[2].before.R_base_flange)
-    elsewhere = Outcome(dwells(UP, DOWN, LEFT), keys={9.8: Key.REDO})
-    assert elsewhere.stops == [1, 2, 2]
-    np.testing.assert_allclose(elsewhere.fit.poses[2].before.R_base_flange, LEFT.as_matrix(), atol=1e-9)
-
-
-def test_skip_and_pause() -> None:
-    skipped = Outcome(dwells(UP, DOWN, LEFT), keys={6.0: Key.SKIP})
-    assert [r.before.R_base_flange[2, 2].round(3) for r in skipped.kept] == [1.0, 0.0]
-    paused = Outcome(dwells(UP, DOWN, LEFT), keys={5.0: Key.PAUSE, 10.9: Key.PAUSE})
-    assert [r.before.R_base_flange[2, 2].round(3) for r in paused.kept] == [1.0, 0.0]
 
 
 def test_keys_pressed_while_a_pose_is_averaged_mean_what_is_shown_then() -> None:
@@ -425,8 +359,7 @@ def test_a_sensor_that_recovers_is_waited_for_and_its_failure_is_reported_once()
     assert "a cable came off" in outcome.person.words()
 
 
-@pytest.mark.parametrize("listen", [False, True])
-@pytest.mark.parametrize("since_s", [4.5, 6.3, 8.2])  # on the way, before and while pose 2 is averaged
+@pytest.mark.parametrize(("since_s", "listen"), [(4.5, True), (8.2, False)])  # on the way; pose 2 is averaged
 def test_an_arm_that_is_silent_for_a_second_is_waited_for(since_s: float, listen: bool) -> None:
     outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), silent_s=(since_s, since_s + 1.0), listen=listen)
     assert [r.before.R_base_flange[2, 2].round(3) for r in outcome.kept] == [1.0, -1.0, 0.0]
@@ -439,10 +372,8 @@ def test_an_arm_that_is_silent_for_a_second_is_waited_for(since_s: float, listen
     [
         ({"recover": True, "unplugged_s": 8.0, "away_s": 11.7}, None),
         ({"recover": True, "unplugged_s": 8.0, "away_s": 12.5}, StreamBroken),
-        ({"recover": True, "unplugged_s": 8.0, "away_s": 1e9}, StreamBroken),
         ({"silent_s": (8.0, 19.7)}, None),
         ({"silent_s": (8.0, 21.6)}, DeviceTimeout),
-        ({"silent_s": (8.0, np.inf)}, DeviceTimeout),
     ],
 )
 def test_a_device_that_comes_back_within_12_s_is_waited_for(
@@ -527,18 +458,6 @@ def test_listening_ends_when_the_program_is_back_at_its_first_pose() -> None:
     assert {event.hint for event in outcome.person.shown if isinstance(event, Estimated)} == {""}
 
 
-def test_a_program_that_passes_its_first_pose_is_followed_to_its_end() -> None:
-    ends_s = 9 * (4.0 + MOVE_S) - MOVE_S
-    outcome = Outcome(
-        dwells(UP, DOWN, UP, LEFT, RIGHT, FRONT, BACK, UP, Rotation.from_euler("x", 50, degrees=True)),
-        listen=True,
-        says=lambda t: status("playing" if t < ends_s else "stopped"),
-    )
-    assert outcome.stops == [1, 2, 3, 4, 5, 6, 7]
-    assert [record.pose.number for record in outcome.kept] == [1, 2, 3, 4, 5, 6, 7]
-    assert "ended: 7 poses" in outcome.person.words()
-
-
 def test_only_standstills_of_the_running_program_count_and_the_last_though_it_has_ended() -> None:
     def says(t: float) -> ArmStatus:
         moments = [(5, "stopped"), (11, "playing"), (15.4, "paused"), (22, "playing"), (1e9, "stopped")]
@@ -562,20 +481,13 @@ def test_a_program_that_ends_where_it_has_been_ends_it() -> None:
 # ------------------------------------------------------------------ what breaks
 
 
-@pytest.mark.parametrize("listen", [False, True])
-@pytest.mark.parametrize("what", ["arm", "sensor"])
-@pytest.mark.parametrize("at_s", [5.0, 8.0])
+@pytest.mark.parametrize(("what", "at_s", "listen"), [("arm", 5.0, True), ("sensor", 8.0, False)])
 def test_a_device_that_fails_ends_it_at_once_and_what_is_committed_stands(what: str, at_s: float, listen: bool) -> None:
     outcome = Outcome(
         dwells(UP, DOWN, LEFT), listen=listen, fails={what: at_s}, raises=pytest.raises(ConnectionError, match=what)
     )
     assert outcome.stops == [1]
     assert outcome.cell.now_s < at_s + AVERAGE_S + 0.2
-
-
-def test_a_slow_sensor_is_averaged_for_longer() -> None:
-    outcome = Outcome(dwells(UP, DOWN, seconds=12.0), rate_Hz=9)
-    assert [len(record.samples.wrench) for record in outcome.kept] == [36, 36]
 
 
 def test_a_sensor_that_is_too_slow_is_refused() -> None:
@@ -589,11 +501,3 @@ def test_without_an_operator_it_ends_and_what_is_committed_stands() -> None:
 
     outcome = Outcome(dwells(*AROUND), at_commit=leave, raises=pytest.raises(SupervisorGone, match="terminal"))
     assert outcome.stops == [1, 2]
-
-
-def test_a_disk_that_is_full_ends_it() -> None:
-    def full(_: Outcome) -> None:
-        raise OSError("No space left on device")
-
-    outcome = Outcome(dwells(UP), at_commit=full, raises=pytest.raises(OSError, match="No space"))
-    assert not any(isinstance(event, PoseTaken) for event in outcome.person.shown)

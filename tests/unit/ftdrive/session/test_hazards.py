@@ -1,10 +1,9 @@
 """The rows of the hazard table."""
 
-import json
 import re
 from pathlib import Path
 
-from ftdrive.session.events import GuardTripped, Hazard
+from ftdrive.session.events import Hazard
 
 ROOT = Path(__file__).parents[4]
 PAGE = ROOT / "docs/reference/hazards.md"
@@ -24,9 +23,3 @@ def test_the_tests_that_the_page_names_exist() -> None:
     assert len(named) > 50
     code = "".join(file.read_text(encoding="utf-8") for file in (ROOT / "tests").rglob("test_*.py"))
     assert [name for name in named if name not in code] == []
-
-
-def test_json_has_the_number_of_the_row() -> None:
-    event = GuardTripped(hazard=Hazard.CONTACT, words="31 N")
-    assert json.loads(json.dumps(event.to_dict()))["hazard"] == 14
-    assert f"{event.hazard}" == "14"

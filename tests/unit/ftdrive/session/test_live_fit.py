@@ -19,7 +19,7 @@ from ftdrive.planning.search.nodes import NUMBERS
 from ftdrive.runs.load import Load
 from ftdrive.runs.pose_hints import hints
 from ftdrive.session.events import Estimated
-from ftdrive.session.live_fit import HUNG_TILT_RAD, RunningFit, faces
+from ftdrive.session.live_fit import HUNG_TILT_RAD, RunningFit
 from ftdrive.terminal.report import print_result
 from ftdrivers.interfaces import FtSamples
 from tests.known_cells import UPSIDE_DOWN
@@ -75,20 +75,6 @@ def run(taken: list[PoseRecord], running: RunningFit | None = None) -> Estimated
     return running.add(taken[-1])
 
 
-def test_one_pose_is_a_start() -> None:
-    running = RunningFit()
-    event = running.add(tour()[0])
-    assert event.poses == 1
-    assert event.values == {}
-    assert event.residual_sigma is None
-    assert event.faces == (0, 0, 0, 0, 0, 1)  # the paper's first orientation: flange z upwards, gravity along -z
-    assert event.light == "red"
-    assert event.hint
-    assert np.isinf(event.cond9)
-    assert running.predict(special([5])[0]) is None
-    assert '"cond9": null' in str(event.to_dict()).replace("'", '"').replace("None", "null")
-
-
 def test_the_special_orientations_have_the_figures_of_the_theory() -> None:
     event = run(records(special(T12)))
     assert event.faces == (2, 2, 2, 2, 2, 2)
@@ -98,9 +84,7 @@ def test_the_special_orientations_have_the_figures_of_the_theory() -> None:
     assert event.light == "green"
 
 
-@pytest.mark.parametrize(
-    ("half_angle_deg", "light"), [(70, "green"), pytest.param(37, "amber", marks=pytest.mark.slow), (15, "red")]
-)
+@pytest.mark.parametrize(("half_angle_deg", "light"), [(70, "green"), (15, "red")])
 def test_the_light_distinguishes_wide_cones_from_narrow_ones(half_angle_deg: float, light: str) -> None:
     from ftcalib.poses.selection import choose
 
@@ -169,54 +153,6 @@ def test_a_bumped_pose_stands_out_when_it_comes_and_can_be_taken_again() -> None
     running.remove(99)
 
 
-def test_the_first_pose_can_be_taken_again() -> None:
-    running, first = RunningFit(), tour()[0]
-    running.add(first)
-    running.remove(1)
-    assert running.add(first).poses == 1
-
-
-def test_a_stop_taken_twice_counts_once() -> None:
-    running, taken = RunningFit(), tour()
-    run(taken[:12], running)
-    assert running.add(taken[4]).poses == 12
-
-
-def test_the_return_to_the_first_pose_changes_no_estimate_but_is_compared() -> None:
-    running, taken = RunningFit(), tour()
-    before = run(taken[:-1], running)
-    after = running.add(taken[-1])
-    assert after.poses == 24
-    assert after.values["mass_kg"] == before.values["mass_kg"]
-    assert after.residual_sigma is not None
-    assert after.residual_sigma < 5
-
-
-def test_an_arm_on_a_wall_is_seen_as_such_once_the_fit_knows() -> None:
-    wall = Parameters(
-        TRUTH.R_flange_sensor,
-        np.array([0.0, -11.0, 0.0]),
-        TRUTH.force_bias_N,
-        TRUTH.p_sensor_com_m,
-        TRUTH.torque_bias_Nm,
-    )
-    R = special(range(1, 15))  # not as many on each face
-    event = run([record(stop, one, stop, truth=wall) for stop, one in enumerate(R, start=1)])
-    assert event.faces == faces(-R[:, 1])
-    estimate = RunningFit(down_base=(0, -1, 0)).add(record(1, R[0], 1, truth=wall))
-    assert estimate.faces == faces(-R[:1, 1])
-
-
-def test_drift_is_shown_with_the_estimates() -> None:
-    drifting = [
-        record(one.stop, one.before.R_base_flange, one.pose.number, bump_N=0.5 * k / 23)
-        for k, one in enumerate(tour()[:-1])
-    ]
-    event = run(drifting)
-    assert event.values["drift"][0] == pytest.approx(0.5, abs=5 * event.sigma["drift"][0])
-    assert "drift" not in run(tour()).values
-
-
 # At the end: what happened at which pose.
 
 Disturbed = Callable[[int, Array, np.random.Generator], Array]
@@ -268,12 +204,6 @@ def test_nothing_is_said_of_quiet_runs_and_inexact_arms_and_no_pose_is_named_whe
         assert hint.code == "sensor_drifts"
 
 
-def test_a_bumped_pose_is_named() -> None:
-    (hint,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 8) * np.array([0.8, 0, 0, 0, 0.03, 0])))
-    assert (hint.code, hint.values["pose"]) == ("pose_touched", name(8))
-    assert hint.values["force_N"] == pytest.approx(0.8, abs=0.05)
-
-
 def test_a_cable_that_pulls_in_three_poses_is_named_with_them() -> None:
     pull = np.array([0.3, 0.2, 0.4, 0.01, -0.03, 0.03])
     found = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop in {5, 6, 14}) * pull))
@@ -281,11 +211,10 @@ def test_a_cable_that_pulls_in_three_poses_is_named_with_them() -> None:
     assert found[-1].values["poses"] == [name(5), name(6), name(14)]
 
 
-@pytest.mark.parametrize("since", [6, pytest.param(20, marks=pytest.mark.slow)])
-def test_a_load_that_shifts_is_named_with_the_pose_from_which_on(since: int) -> None:
+def test_a_load_that_shifts_is_named_with_the_pose_from_which_on() -> None:
     shifted = replace(TRUTH, p_sensor_com_m=TRUTH.p_sensor_com_m + np.array([0.004, 0.002, 0]))
-    change = changed(disturbed(lambda stop, R, _: predict(shifted if stop >= since else TRUTH, R)))
-    assert (change.code, change.values["pose"]) == ("com_shifted", since)
+    change = changed(disturbed(lambda stop, R, _: predict(shifted if stop >= 6 else TRUTH, R)))
+    assert (change.code, change.values["pose"]) == ("com_shifted", 6)
 
 
 def test_a_tare_in_mid_tour_is_a_step_of_the_bias() -> None:
@@ -318,15 +247,6 @@ def test_a_pose_that_moved_is_named_and_not_explained_otherwise() -> None:
 def test_a_first_pose_that_is_touched_at_the_end_is_no_drift() -> None:
     (hint,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 25) * np.array([0.5, 0, 0, 0, 0, 0])))
     assert (hint.code, hint.values["pose"]) == ("return_differs", name(1))
-
-
-def test_a_slight_drift_of_the_torque_does_not_explain_a_touch_at_the_end() -> None:
-    touch, drift = np.array([0.5, 0, 0, 0, 0, 0]), np.array([0, 0, 0, 0, 0, 0.003])
-    taken = disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 25) * touch + stop / 25 * drift)
-    result = solve(dataset_from(taken, {}))
-    assert result.drift is not None
-    (hint,) = hints(result, taken)
-    assert hint.code == "return_differs"
 
 
 def test_the_rate_of_a_drift_is_that_of_what_drifts(capsys: pytest.CaptureFixture[str]) -> None:

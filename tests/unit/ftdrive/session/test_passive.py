@@ -18,7 +18,7 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.source import Circumstances
 from ftdrive.session.events import Key
 from ftdrive.session.open_session import Journal, OpenCell
-from ftdrive.session.passive import PART_S, record_passively
+from ftdrive.session.passive import record_passively
 from ftdrivers.errors import StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.fake_clock import FakeClock
@@ -132,13 +132,6 @@ def test_what_was_recorded_before_a_failure_is_kept_and_solved(
     assert MotionRecording.load(files_of(run.motion_path)[-1]).samples.seq[-1] >= 500 * (13.0 - STEP_S) - 1
     monkeypatch.setattr(source, "circumstances_of", lambda _: Circumstances(9.80665, Setup(), {}))
     assert source.solve_in_motion(run).verdict in {"good", "usable"}
-
-
-def test_memory_holds_one_part_at_a_time(free: Recorded, tmp_path: Path) -> None:
-    run = passively(FakeCell(free), tmp_path, 8.0)
-    assert max(len(one.samples) for one in map(MotionRecording.load, files_of(run.motion_path))) <= 500 * (
-        PART_S + STEP_S
-    )
 
 
 @pytest.mark.slow

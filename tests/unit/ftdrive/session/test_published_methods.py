@@ -41,8 +41,6 @@ def test_the_run_keeps_its_method_and_every_solve_uses_it(lab: Lab) -> None:
     ("method", "sets", "words"),
     [
         ("srom", None, "the tour has 6 of them: plan all 24"),
-        ("srom", "H", "the tour has 0 of them"),
-        pytest.param("mixed", "H", "the tour has 0 of them", marks=pytest.mark.slow),
         ("srom", "A+H", "the tour has 12 other poses: choose --method mixed"),
     ],
 )

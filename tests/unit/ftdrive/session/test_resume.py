@@ -11,20 +11,16 @@ import pytest
 
 from ftdrive.cell.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
-from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.nodes import constant_tour
 from ftdrive.runs.run import Run
 from ftdrive.session import drive
 from ftdrive.session.events import (
-    Checked,
     Estimated,
     Event,
     Key,
     Noted,
     PoseTaken,
     RunOpened,
-    State,
-    StateChanged,
 )
 from ftdrive.words.result import drift_in_words
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
@@ -58,22 +54,20 @@ ON_ITS_WAY = {
     "redo stops the arm and goes back from there": Case(
         {"move 4": press(Key.REDO)}, taken=(1, 2, 3, 3, 4, 5, 6, 7), asked={"Approach to pose 3": 1}
     ),
-    **{
-        f"a {key} without a pose to act on stops the arm": Case(
-            {"move 4": press(key)}, ("resume",), holds=((4, ""),), asked={"Approach to pose 4": 1}
-        )
-        for key in (Key.KEEP, Key.OTHER)
-    },
+    "skip stops the arm and goes round that pose": Case(
+        {"move 4": press(Key.SKIP)},
+        taken=(1, 2, 3, 5, 6, 7),
+        asked={"Approach to pose 5": 1},
+        noted={"skipped: pose 4; the arm": 1},
+    ),
+    "another key stops the arm": Case(
+        {"move 4": press(Key.OTHER)}, ("resume",), holds=((4, ""),), asked={"Approach to pose 4": 1}
+    ),
 }
 WHILE_IT_STANDS = {
     "skip while a pose is measured skips that one": Case(
         {"measuring 4": press(Key.SKIP)}, taken=(1, 2, 3, 5, 6, 7), moves=7, asked={"Approach to pose 5": 0}
     ),
-    "skip with no pose under way skips none": Case({"taken 4": press(Key.SKIP)}, noted={"nothing to skip": 1}),
-    "keep has nothing to do in a tour": Case(
-        {"taken 3": press(Key.KEEP)}, noted={"press r to take the last one again": 1}
-    ),
-    "another key means nothing": Case({"taken 3": press(Key.OTHER)}),
     "redo before any pose or twice does nothing more": Case(
         {"approach": once(press(Key.REDO)), "taken 2": once(press(Key.REDO, Key.REDO))},
         ("resume",),
@@ -89,36 +83,6 @@ def test_a_key(case: Case, lab: Lab) -> None:
     case.play(lab)
 
 
-def test_skip_on_the_way_stops_the_arm_and_goes_round_that_pose(lab: Lab) -> None:
-    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.SKIP)
-    lab.take_poses()
-    assert lab.taken() == [1, 2, 3, 5, 6, 7]
-    assert lab.arm.stops == 1
-    fourth = np.array(Plan.load(lab.run().plan_path).steps[3].q_rad)
-    assert [np.abs(goal - fourth).max() < 1e-9 for goal, *_ in lab.arm.moves].count(True) == 1  # the one broken off
-    assert [question for question in lab.operator.asked if "Approach to pose 5" in question.text]
-    assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
-    assert State.HOLD not in lab.operator.states()
-    assert "skipped: pose 4; the arm" in lab.said()
-
-
-def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> None:
-    def redo() -> None:
-        if lab.taken()[-1:] == [5] and not again:
-            again.append(True)
-            lab.operator.keys.append(Key.REDO)
-
-    again: list[bool] = []
-    lab.sensor.collecting = redo  # while pose 6 is measured: pose 5 is the last that was shown
-    lab.press((Key.REDO, PoseTaken, 1), (Key.REDO, StateChanged, 4))  # while the arm stands, and on its way
-    lab.take_poses()
-    assert lab.taken() == [1, 1, 2, 3, 3, 4, 5, 5, 6, 7]
-    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
-    assert lab.arm.stops == 1  # on its way to pose 4
-    ways = [question.text for question in lab.operator.asked if "Approach to pose" in question.text]
-    assert len(ways) == 1  # the first approach: it was stopped before it had left pose 3
-
-
 def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> None:
     at(lab, "taken 3", both(press(Key.REDO), lambda lab: at(lab, "measuring 3", press(Key.SKIP))))
     outcome = lab.calibrate()
@@ -127,23 +91,6 @@ def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> Non
     assert outcome is not None
     assert outcome.result.n_poses == 6
     assert [event.poses for event in lab.operator.of(Estimated)][:5] == [1, 2, 3, 3, 4]
-
-
-def test_skip_of_the_first_pose_while_it_is_taken_again_keeps_it_and_names_the_return(lab: Lab) -> None:
-    lab.operator.answers["Pose 2 of 7"] = ["r"]
-    lab.operator.answers["Pose 1 of 7"] = ["", "s"]
-    outcome = lab.calibrate(mode="step")
-    assert lab.taken() == [1, 2, 3, 4, 5, 6]
-    assert "pose 1 keeps" in lab.said()
-    assert "skipped: the return to pose 1" in lab.said()
-    assert outcome is not None
-    assert outcome.result.n_poses == 6
-    assert outcome.drift is None
-    lab.operator.shown.clear()
-    outcome = lab.calibrate(resume=lab.run().folder)
-    assert lab.taken() == [7]
-    assert outcome is not None
-    assert outcome.drift is not None
 
 
 def test_a_first_pose_that_is_repeated_after_its_return_gives_the_drift_between_the_two(lab: Lab) -> None:
@@ -199,29 +146,6 @@ def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None
     assert (run.folder / "calibration.json").read_bytes() == first
 
 
-@pytest.mark.parametrize(
-    ("begun", "asked", "in_steps"),
-    [pytest.param("step", "auto", True, marks=pytest.mark.slow), ("auto", "step", True), ("auto", "auto", False)],
-)
-def test_a_run_goes_on_in_its_own_mode_or_in_steps(begun: str, asked: str, in_steps: bool, lab: Lab) -> None:
-    folder = broken_off(lab, mode=begun)
-    lab.operator.asked.clear()
-    lab.take_poses(resume=folder, mode=asked)
-    steps = [question.text.split(",")[0] for question in lab.operator.asked if "Enter" in question.text]
-    assert steps == [f"Pose {stop} of 7" for stop in (3, 4, 5, 6, 7) if in_steps]
-
-
-def test_a_resumed_run_is_open_with_its_poses_before_anything_is_checked(lab: Lab) -> None:
-    folder = broken_off(lab)
-    lab.operator.shown.clear()
-    assert lab.take_poses(resume=folder, dry_run=True) is None
-    kinds = [type(event) for event in lab.operator.shown]
-    assert kinds.count(RunOpened) == 1
-    assert kinds.index(RunOpened) < kinds.index(Checked)
-    before = lab.operator.shown[: kinds.index(Checked)]
-    assert [event.poses for event in before if isinstance(event, Estimated)] == [1, 2]
-
-
 def test_a_run_is_not_gone_on_with_another_tool(lab: Lab) -> None:
     folder = broken_off(lab)
     lab.cell = replace(lab.cell, tool=ToolConfig(cylinders_mm=((0.0, 210.0, 100.0),)))
@@ -265,17 +189,12 @@ BEGUN: dict[str, Any] = {"counts_per_N": 100.0, "counts_per_Nm": 1000.0, "range"
     [
         (NO_SERIAL, NO_SERIAL | {"model": "UR wrist"}, "serial not reported, but UR wrist.*serial=… in its address"),
         ({}, {"model": "UR wrist"}, "serial S1, but UR wrist.*connect the sensor of the run"),
-        (NO_SERIAL, {}, "serial=… in its address"),
         (NO_SERIAL, NO_SERIAL, ""),
         ({}, {"url": "ati-can://can0?slot=2"}, "slot was 0"),
-        ({}, {"url": "ati-serial:///dev/ttyUSB0?calibration=2"}, "calibration was 1"),
         ({}, {"url": "ati-can:///dev/ttyACM0?interface=slcan&slot=0x0&recover=1&bitrate=250000"}, ""),
         ({}, {"sign": -1}, r"sign .*1 .*-1"),
         ({}, {"facts": {"counts_per_N": 200.0}}, "counts_per_N was 100.0"),
-        ({}, {"facts": {"counts_per_Nm": 200.0}}, "counts_per_Nm was 1000.0"),
-        ({}, {"facts": {"range": (99.0,) * 6}}, "range was"),
         ({"arm": ("UR5e", NOT_REPORTED)}, {"arm": ("UR7e", NOT_REPORTED)}, "not reported, but UR7e"),
-        ({"arm": ("UR5e", NOT_REPORTED)}, {"arm": ("UR5e", NOT_REPORTED)}, ""),
     ],
 )
 def test_a_run_goes_on_only_with_its_arm_and_sensor_and_where_the_numbers_mean_the_same(
@@ -329,14 +248,6 @@ def by_hand(lab: Lab, at_pose: Callable[[int], None] = lambda _: None) -> None:
     lab.operator.has_keys, lab.operator.on_event = False, on_event
 
 
-def test_by_hand_and_without_keys_the_session_ends_with_a_calibration(lab: Lab) -> None:
-    by_hand(lab)
-    outcome = lab.calibrate(mode="manual")
-    assert outcome is not None
-    assert 6 <= outcome.result.n_poses < 24
-    assert outcome.run.calibration_path.exists()
-
-
 def test_a_session_that_is_interrupted_says_how_to_solve_what_is_there(lab: Lab) -> None:
     def at_pose(stop: int) -> None:
         if stop == 3:
@@ -348,13 +259,6 @@ def test_a_session_that_is_interrupted_says_how_to_solve_what_is_there(lab: Lab)
     words = lab.operator.of(Noted)[-1].words
     assert words.endswith(f"or solve them with\n{lab.run().solve_command}")
     assert lab.run().stops() == [1, 2, 3]
-
-
-def test_what_the_sensor_went_through_is_written_down(lab: Lab) -> None:
-    lab.sensor.events = ((17, "connected again"),)
-    lab.take_poses()
-    reconnected = [event for event in lab.operator.of(Noted) if "connected again" in event.words]
-    assert len(reconnected) == 1
 
 
 def test_options_that_cannot_be_used_are_reported_before_anything_opens(lab: Lab) -> None:

@@ -1,22 +1,14 @@
 """What stops the arm on the fake cell: each fault injected on the way, the hold, and how it goes on."""
 
-from contextlib import suppress
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from ftcalib.routine import PoseRecord
-from ftdrive.errors import Declined, SupervisorGone
-from ftdrive.planning.approach import Approach, plan_approach
-from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.motion import Speeds
+from ftdrive.errors import SupervisorGone
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Run
-from ftdrive.session import drive
-from ftdrive.session.events import Checked, Event, GuardTripped, Key, PoseTaken, State, StateChanged
+from ftdrive.session.events import Checked, Event, GuardTripped, Key, State, StateChanged
 from ftdrive.session.preflight import Before
 from ftdrivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import FtSamples
@@ -43,11 +35,6 @@ def lose_controller(lab: Lab) -> None:
     lab.arm.gone = DeviceTimeout("silent")
 
 
-def heal_with_another_zero(lab: Lab) -> None:
-    lab.sensor.heals = True
-    push()(lab)
-
-
 def lose_sensor_and_heal(lab: Lab) -> None:
     lab.sensor.heals = True
     lose_sensor(lab)
@@ -55,13 +42,6 @@ def lose_sensor_and_heal(lab: Lab) -> None:
 
 def forbid_once(lab: Lab) -> None:
     lab.arm.forbidden = None if lab.arm.forbidden is not None else lab.arm.q.copy()  # no pose of the plan
-
-
-def end_the_program(lab: Lab) -> None:
-    lab.arm.set_status(program="stopped")
-    lab.clock.sleep(0.2)  # the guards look meanwhile, and stop the arm
-    failed = DeviceFault("the control program failed in line 60: is a joint limit violated?", "read the log")
-    raise DeviceFault("a stop was requested before the arm arrived") from failed
 
 
 NO_PUSH = push(0.0)
@@ -176,28 +156,10 @@ STOPS = {
         holds=((4, CONTACT),),
         noted={"not yet": 1, "remote: local control": 1},
     ),
-    "a question that is not answered with yes leads back to the hold": Case(
-        {"move 4": status("robot emergency stop"), "hold": status()},
-        ("resume", "resume"),
-        {"Is the emergency stop within reach": ("yes", "no", "yes")},
-        rows=(11,),
-        holds=((4, "robot emergency stop"),),
-        noted={"not yet": 1, "not yet: not confirmed": 1},
-    ),
     "the way on is asked of the controller too": Case(
         {"move 4": press(Key.PAUSE), "hold": forbid_once},
         ("resume", "resume"),
         holds=((4, "paused"), (4, "the controller's safety limits forbid")),
-    ),
-    "what the arm reports of its program is shown instead of a guess": Case(
-        {"move 4": end_the_program}, ends="line 60", rows=(21, 21), holds=((4, "line 60"),), taken=(1, 2, 3)
-    ),
-    "a sensor that was switched off may have another zero": Case(
-        {"move 2": lose_sensor, "hold": heal_with_another_zero},
-        ("resume",),
-        rows=(15,),
-        holds=((2, "a cable came off"),),
-        noted={"not yet": 0},
     ),
     "a sensor that comes back while the arm stands needs no operator": Case(
         {"measuring 3": lose_sensor_and_heal}, rows=(15,), noted={"restarts": 1}
@@ -230,7 +192,6 @@ STOPS = {
         )
         for way, answers, rows, holds, taken, moves in (
             ("to pose 1", (), (21,), ((0, "joint 1"),), (), 0),
-            ("to pose 4", ("resume",), (14, 21), ((4, CONTACT), (4, "joint 1")), (1, 2, 3), 4),
             ("back", ("back",), (14, 21), ((4, CONTACT), (4, "joint 1")), (1, 2, 3), 4),
         )
     },
@@ -262,27 +223,12 @@ STOPS = {
         holds=((4, CONTACT),),
         taken=(1, 2, 3),
     ),
-    "a pause that the supervisor leaves ends with the absence": Case(
-        {"move 4": press(Key.PAUSE), "asked resume:": leave},
-        ends=LEFT,
-        error=SupervisorGone,
-        rows=(27,),
-        holds=((4, "paused"),),
-        taken=(1, 2, 3),
-    ),
     "reduced mode that stays is confirmed before the arm goes on": Case(
         {"move 4": status("reduced")},
         ("resume",),
         rows=(12,),
         holds=((4, "reduced"),),
         asked={"in reduced mode": 1},
-    ),
-    "reduced mode that ends needs no question": Case(
-        {"move 4": status("reduced"), "hold": status()},
-        ("resume",),
-        rows=(12,),
-        holds=((4, "reduced"),),
-        asked={"in reduced mode": 0},
     ),
     "reduced mode that comes a second time is confirmed again": Case(
         {"move 3": status("reduced"), "move 5": status(), "move 7": status("reduced")},
@@ -328,37 +274,6 @@ def test_after_a_contact_the_arm_goes_back_or_round_it_where_a_person_says_so(la
     assert "skipped: pose 4; the arm" in lab.said()
 
 
-def test_the_way_back_is_confirmed_by_a_person_though_the_plan_is_known(lab: Lab) -> None:
-    lab.take_poses()  # trusted from here on
-    for answer, words in (("resume", "Approach to pose 4"), ("back", "Approach back to pose 3")):
-        lab.operator.asked.clear()
-        lab.arm.moves.clear()
-        lab.push_on_the_way(3)
-        lab.operator.answers["resume:"] = [answer, "quit"]
-        lab.operator.answers["Approach back"] = ["no"]
-        with suppress(Declined):
-            lab.take_poses()
-        (way,) = [question for question in lab.operator.asked if words in question.text]
-        assert (way.assumed is None) == (answer == "back")
-    assert len(lab.arm.moves) == 3
-
-
-def test_back_is_offered_only_on_the_way_from_a_pose_that_was_not_skipped(lab: Lab) -> None:
-    lab.press((Key.PAUSE, StateChanged, 1), (Key.PAUSE, PoseTaken, 2))  # on the first approach; where the arm stands
-    lab.operator.answers["resume:"] = ["resume"] * 3
-
-    def skip_then_pause() -> None:
-        if len(lab.arm.moves) == 5 and not done:
-            done.append(True)
-            lab.operator.keys.append(Key.SKIP)
-            lab.arm.at_move[6] = lambda: lab.operator.keys.append(Key.PAUSE)
-
-    done: list[bool] = []
-    lab.sensor.collecting = skip_then_pause
-    lab.take_poses()
-    assert lab.holds() == [("resume", "skip", "quit")] * 3
-
-
 def test_a_full_disk_holds_before_the_arm_moves_on(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     commit, failed = Run.commit, list[int]()
 
@@ -374,27 +289,6 @@ def test_a_full_disk_holds_before_the_arm_moves_on(lab: Lab, monkeypatch: pytest
     assert lab.operator.of(GuardTripped)[0].hazard == 26
     assert failed == [3]
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
-
-
-def test_each_part_of_a_way_begins_where_the_one_before_should_have_ended(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    move_to = lab.arm.move_to
-
-    def in_two(certifier: Certifier, q_now: Array, q_first: Array, speeds: Speeds) -> Approach:
-        whole = plan_approach(certifier, q_now, q_first, speeds)
-        way_rad = np.linspace(whole.way_rad[0], whole.way_rad[-1], 3)
-        return replace(whole, way_rad=way_rad, speed_rad_s=np.repeat(whole.speed_rad_s, 2))
-
-    def past_it(*args: Any, **kwargs: Any) -> None:
-        move_to(*args, **kwargs)
-        lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 1.0, 0])
-
-    monkeypatch.setattr(drive, "plan_approach", in_two)
-    monkeypatch.setattr(lab.arm, "move_to", past_it)
-    with pytest.raises(DeviceFault, match=r"joint 5 is 1\.0° off"):
-        lab.take_poses()
-    assert len(lab.arm.moves) == 1
 
 
 @pytest.mark.parametrize("seen_by_guards", [True, False])
@@ -423,10 +317,7 @@ def test_saturation_that_the_guards_or_only_the_samples_of_a_pose_show_discards_
 QUESTIONS = ("Is the tool free", "Is the space within", "Is the emergency stop within reach")
 
 
-@pytest.mark.parametrize(
-    "mode", ["robot emergency stop", pytest.param("safeguard stop", marks=pytest.mark.slow), "protective stop"]
-)
-def test_after_an_emergency_stop_the_whole_preflight_is_done_again_questions_too(mode: str, lab: Lab) -> None:
+def test_after_an_emergency_stop_the_whole_preflight_is_done_again_questions_too(lab: Lab) -> None:
     limits: list[int] = []
 
     def repair(lab: Lab) -> None:
@@ -441,7 +332,7 @@ def test_after_an_emergency_stop_the_whole_preflight_is_done_again_questions_too
 
     lab.operator.on_event = on_event
     lab.operator.answers["resume:"] = ["resume"]
-    at(lab, "move 4", status(mode))
+    at(lab, "move 4", status("robot emergency stop"))
     at(lab, "hold", repair)
     lab.take_poses()
     names = [event.name for event in lab.operator.of(Checked)]
@@ -450,7 +341,7 @@ def test_after_an_emergency_stop_the_whole_preflight_is_done_again_questions_too
         *("disk", "limits"),
     ]
     asked = [question for question in lab.operator.asked if question.text.startswith(QUESTIONS)]
-    assert len(asked) == (0 if mode == "protective stop" else 3)
+    assert len(asked) == 3
     assert all(question.assumed is None for question in asked)
     first, again = limits
     assert first > 50  # the poses and the ways between

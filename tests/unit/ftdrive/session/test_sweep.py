@@ -1,12 +1,10 @@
 """A sweep on the fake cell: what is asked, its speed, the hazards of the tour, and what is kept."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
@@ -18,7 +16,7 @@ from ftdrive.runs.motion import MotionRecording
 from ftdrive.session import sweep
 from ftdrive.session.events import GuardTripped, Key, MotionRecorded, State
 from ftdrive.session.guards import ExpectedMotion, Seen
-from ftdrive.session.sweep import FreeToolPrediction, on_script_path
+from ftdrive.session.sweep import on_script_path
 from ftdrivers.clock import REAL
 from ftdrivers.interfaces import ArmState
 from tests.unit.ftdrive.fake_cell import STATUS, Lab
@@ -79,7 +77,7 @@ def test_the_plan_of_a_sweep_is_not_driven_as_a_tour(lab: Lab) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", ["a joint pushed off", "an emergency stop", "a silent sensor", "a silent controller"])
 def test_a_fault_in_a_sweep_stops_the_arm_and_resume_starts_again(fault: str, lab: Lab) -> None:
     hazard, inject, repair = FAULTS[fault]
 
@@ -162,28 +160,3 @@ def seen(t_s: float, R: Array, wrench: Array, sample: int, curve: Array | None) 
     motion = ExpectedMotion(np.zeros(6), np.zeros(6), True, curve)
     state = ArmState(0, 0.0, np.zeros(6), np.zeros(6), R, np.zeros(3))
     return Seen(t_s, 0.01, motion, state, STATUS, wrench, sample, 0.0)
-
-
-def test_the_weight_is_learned_from_three_seconds_on(orientation: Callable[[float], Array]) -> None:
-    tool, rng = FreeToolPrediction(np.array([0, 0, -1.0]), 5.0), np.random.default_rng(0)
-    curve = np.zeros((2, 6))
-
-    def wrench(R: Array) -> Array:
-        force = R.T @ [0, 0, -12.0]
-        return np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
-
-    tool.begin(seen(0.0, np.eye(3), np.zeros(6), 0, curve))
-    for k in range(1000):
-        t_s = 0.01 * k
-        R = orientation(t_s)
-        found = tool.predict(R)
-        assert found is None or t_s > 2.9
-        if t_s > 8.0:
-            assert found is not None
-            assert np.abs(found - wrench(R))[:3].max() < 0.5
-        tool.look(seen(t_s, R, wrench(R) + rng.normal(0, [0.5] * 3 + [0.03] * 3), k + 1, curve))
-
-
-@pytest.fixture
-def orientation() -> Callable[[float], Array]:
-    return lambda t_s: Rotation.from_euler("xyz", [np.sin(0.5 * t_s), np.sin(0.7 * t_s), 0.4 * t_s]).as_matrix()

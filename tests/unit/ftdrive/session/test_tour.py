@@ -11,7 +11,6 @@ import pytest
 from ftcalib.sampling import Sampling
 from ftdrive.cell.config import WorkcellConfig
 from ftdrive.errors import Declined, NotAccepted
-from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, guess_of, plan_tour
@@ -19,9 +18,8 @@ from ftdrive.session import preflight
 from ftdrive.session.along_plan import has_completed, remember_completed
 from ftdrive.session.drive import Progress
 from ftdrive.session.events import Asked, Checked, Key, Noted, Planned, PoseTaken, RunOpened, State
-from ftdrive.session.guards import Guard, Limits, RangeGuard, Seen, StallGuard
+from ftdrive.session.guards import Limits, StallGuard
 from ftdrive.words.session import SessionText, in_words
-from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from tests.unit.ftdrive.fake_cell import MODEL, Lab
 from tests.unit.ftdrive.session.scenarios import Case, once, press
@@ -49,21 +47,6 @@ def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> 
     assert [next(word for word in order if word in text) for text in texts] == order
     assert all(question.assumed is None for question in lab.operator.asked)
     assert len(lab.operator.of(Asked)) == 5
-
-
-def test_the_journal_records_unanswered_questions(lab: Lab) -> None:
-    beside = lab.arm.q
-    lab.take_poses(yes=True)  # a first run: --yes answers nothing
-    assert {event.by for event in lab.operator.of(Asked)} == {"person"}
-    lab.operator.shown.clear()
-    lab.operator.asked.clear()
-    lab.operator.answers["tool free"] = ["no"]
-    lab.arm.q = beside
-    lab.take_poses(yes=True)
-    assert lab.operator.asked == []
-    answered = [(event.answer, event.by) for event in lab.operator.of(Asked)]
-    assert answered == [(answer, "--yes") for answer in ("yes", "yes", "yes", "MOVE", "yes")]
-    assert all(in_words(event).endswith(f"{event.answer} (--yes)") for event in lab.operator.of(Asked))
 
 
 def test_the_first_run_is_slow_whatever_was_asked_and_the_second_may_be_fast(lab: Lab) -> None:
@@ -115,26 +98,6 @@ def test_how_long_to_average_is_chosen_from_the_noise_of_the_sensor(lab: Lab) ->
     assert f"average {average_s:.1f} s at each pose" in " ".join(note.words for note in lab.operator.of(Noted))
 
 
-def test_what_is_predicted_before_it_moves_comes_true(lab: Lab) -> None:
-    # The fake sensor is perfect, which its data sheet must say.
-    tool, sensor = replace(lab.cell.tool, mass_kg=1.2), replace(lab.cell.sensor, accuracy_percent=0.1)
-    lab.cell = replace(lab.cell, sampling=Sampling(average_s=0.3, noise_record_s=0.0), tool=tool, sensor=sensor)
-    outcome = lab.calibrate()
-    assert outcome is not None
-    (words,) = [
-        note.words for note in lab.operator.of(Noted) if "predicted for 1.2 kg, a sensor gain error" in note.words
-    ]
-    told_g = float(words.split("mass ")[1].split(" g")[0])
-    assert told_g == pytest.approx(1e3 * float(outcome.result.sigma["mass_kg"]), rel=0.7)
-
-
-def test_the_first_limit_of_contact_names_the_mass_it_assumes(lab: Lab) -> None:
-    lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=1.2))
-    lab.arm.at_move[4] = lambda: setattr(lab.sensor, "push", np.array([60.0, 0, 0, 0, 0, 0]))
-    with pytest.raises(DeviceFault, match=r"a tool of 1.2 kg"):
-        lab.take_poses()
-
-
 def has_run(lab: Lab) -> bool:
     """Return whether the plan of the run counts as run to its end."""
     return has_completed("A1", str(Plan.load(lab.run().plan_path).to_dict()["sha256"]))
@@ -142,7 +105,6 @@ def has_run(lab: Lab) -> bool:
 
 RUNS = {
     "without interruption": (Case({}, noted={"slow again": 0}), True),
-    "in steps": (Case({}, mode="step", noted={"slow again": 0}), True),
     "a pose skipped where the arm stands": (
         Case({"measuring 4": press(Key.SKIP)}, taken=(1, 2, 3, 5, 6, 7), noted={"poses are missing": 1}),
         False,
@@ -175,18 +137,6 @@ def test_a_run_counts_as_complete_if_every_move_of_the_plan_was_driven(what: str
     assert has_run(lab) == complete
 
 
-def test_a_skipped_pose_counts_against_the_plan_though_resume_takes_it(lab: Lab) -> None:
-    lab.operator.answers["Pose 3 of 7"] = ["s"]
-    lab.take_poses(mode="step")
-    assert "slow again" in lab.said()
-    assert "moves from poses 2 and 3 were replaced" in lab.said()
-    lab.operator.shown.clear()
-    lab.take_poses(resume=lab.run().folder, mode="auto")
-    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
-    assert not has_run(lab)
-    assert "slow again" in lab.said()
-
-
 @pytest.mark.slow
 def test_a_plan_counts_once_all_its_poses_are_taken_again(lab: Lab) -> None:
     lab.operator.answers["Pose 3 of 7"] = ["s"]
@@ -213,14 +163,6 @@ def test_an_arm_that_reports_no_serial_number_runs_slowly_each_time_and_the_reas
         assert "every run of a plan" in lab.said()
     remember_completed(NOT_REPORTED, "p")  # as an earlier version did
     assert not has_completed(NOT_REPORTED, "p")
-
-
-def test_a_run_in_which_nothing_moved_does_not_count_as_complete(lab: Lab) -> None:
-    lab.operator.answers["Pose "] = ["s"] * 6
-    with pytest.raises(Declined, match="ended before the first pose"):
-        lab.take_poses(mode="step")
-    assert lab.arm.moves == []
-    assert not has_completed("A1", str(Plan.load(lab.run().plan_path).to_dict()["sha256"]))
 
 
 def test_a_dry_run_shows_all_and_moves_nothing(lab: Lab) -> None:
@@ -284,27 +226,6 @@ def test_a_run_that_goes_on_from_elsewhere_is_confirmed_by_a_person(lab: Lab) ->
         assert [question.assumed is not None for question in lab.operator.asked] == [assumed] * 4
 
 
-def test_an_onlooker_sees_every_look_of_the_guards(lab: Lab) -> None:
-    seen: list[Seen] = []
-
-    class Onlooker(Guard):
-        def look(self, seen_now: Seen) -> None:
-            assert lab.guards_look
-            seen.append(seen_now)
-
-    def watch(certifier: Certifier, load: RangeGuard) -> Guard:
-        assert certifier.arm.name == "UR5e"
-        assert lab.operator.of(Planned)
-        assert not lab.operator.asked
-        assert load.zero.shape == (6,)
-        return Onlooker()
-
-    lab.take_poses(watch=watch)
-    assert {one.motion.moving for one in seen} == {True, False}
-    goals = {tuple(one.motion.goal_rad) for one in seen}
-    assert len(goals) == 6
-
-
 def test_the_plan_of_a_dry_run_is_looked_at_until_enter(lab: Lab) -> None:
     assert lab.take_poses(dry_run=True, watch=lambda *_: StallGuard(Limits())) is None
     assert [question.answers for question in lab.operator.asked] == [("",)]
@@ -324,15 +245,6 @@ def test_step_mode_waits_for_enter_before_each_move(lab: Lab) -> None:
     assert asked == [f"Pose {stop} of 7" for stop in (1, 2, 3, 4, 5, 4, 5, 6, 7)]
     assert lab.stops() == [1, 2, 4, 5, 6, 7]
     assert (lab.run().folder / "poses" / "04-2.npz").exists()
-
-
-def test_a_first_pose_that_is_skipped_is_not_returned_to(lab: Lab) -> None:
-    lab.operator.answers["Pose 1 of 7"] = ["s"]
-    lab.take_poses(mode="step")
-    assert lab.stops() == [2, 3, 4, 5, 6]
-    first = np.array(Plan.load(lab.run().plan_path).steps[0].q_rad)
-    assert min(np.abs(goal - first).max() for goal, *_ in lab.arm.moves) > np.radians(5)
-    assert "pose 1 and the return" in lab.said()
 
 
 def test_step_mode_says_what_enter_does(lab: Lab) -> None:

@@ -20,7 +20,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Reading, Run
 from ftdrive.runs.verification import NO_LIMITS, Limits, Verified, save_update, verification_near, verify_run
 from ftdrive.session.along_plan import has_completed
-from ftdrive.session.events import Checked, Compared, Noted, PoseTaken, RunOpened, State
+from ftdrive.session.events import Compared, Noted, PoseTaken
 from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.session import take_poses
 from ftdrive.session.verifying import RunningComparison, Verifying
@@ -111,17 +111,6 @@ def test_an_unchanged_cell_passes_at_poses_that_were_not_used(
     assert (last.passed, last.path) == (True, str(found.path.absolute()))
     with pytest.raises(NotObservable):
         save_update(found)
-
-
-def test_the_session_is_that_of_a_calibration(lab: Lab, take: Callable[..., Run]) -> None:
-    run = take()
-    texts = [question.text for question in lab.operator.asked]
-    order = ["tool free", "within 0.3", "emergency stop within reach", "Type MOVE", "Begin"]
-    assert [next(word for word in order if word in text) for text in texts] == order
-    assert {event.name for event in lab.operator.of(Checked)} >= {"plan", "approach", "safety", "limits"}
-    assert lab.operator.states()[-1] is State.REPORT
-    (opened,) = lab.operator.of(RunOpened)
-    assert opened.resume == f"ftdrive verify --resume {run.folder}"
 
 
 def test_a_step_of_the_bias_is_named_and_the_update_names_its_parent(
@@ -222,20 +211,3 @@ def test_only_fresh_poses_count_by_hand(lab: Lab, calibration: CalibrationResult
     assert (near.light, bool(near.hint)) == ("amber", True)
     tilted = Rotation.from_euler("x", 40, degrees=True).as_matrix()
     assert comparison.add(turned(records[2], tilted)).light == "green"
-
-
-def test_the_contact_guard_trusts_the_calibration_once_it_holds(lab: Lab, calibration: CalibrationResult) -> None:
-    records = records_of(lab, calibration)
-    comparison, seen = RunningComparison(calibration, np.zeros((0, 3, 3)), wanted=6), []
-    for record in records[:3]:
-        seen.append(comparison.predict(record.before.R_base_flange))
-        comparison.add(record)
-    assert seen == [None, None, None]
-    predicted = comparison.predict(records[4].before.R_base_flange)
-    assert predicted is not None
-    assert predicted == pytest.approx(records[4].mean.mean, abs=0.1)
-    off = replace(calibration.parameters, force_bias_N=calibration.force_bias_N + np.array([3.0, 0.0, 0.0]))
-    comparison = RunningComparison(replace(calibration, parameters=off), np.zeros((0, 3, 3)), wanted=6)
-    for record in records:
-        comparison.add(record)
-    assert comparison.predict(records[4].before.R_base_flange) is None

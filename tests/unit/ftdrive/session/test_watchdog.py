@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ftdrive.session.events import Event, GuardTripped, Noted, PoseTaken, State, StateChanged
-from ftdrive.session.guards import Guard, Limits, Seen, SensorGuard, StallGuard, Tripped
+from ftdrive.session.guards import Guard, Limits, Seen, Tripped
 from ftdrive.session.open_session import Journal, OpenCell
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import REAL
@@ -76,15 +76,6 @@ def test_a_block_begins_with_a_look_and_goes_on_a_hundred_times_a_second() -> No
         assert len(looks.seen) == pytest.approx(101, abs=1)
 
 
-def test_a_look_that_takes_long_does_not_delay_the_next() -> None:
-    looks = Looks()
-    cell = Cell(looks)
-    cell.arm.answers_s = 0.008
-    with cell.watched():
-        cell.clock.advance(1.0)
-    assert len(looks.seen) == pytest.approx(101, abs=2)
-
-
 @pytest.mark.parametrize(("between_s", "counted_s"), [(0.01, 0.01), (0.018, 0.018), (0.022, 0.02), (3.0, 0.02)])
 def test_the_time_that_this_computer_takes_counts_only_in_part(between_s: float, counted_s: float) -> None:
     looks = Looks()
@@ -95,17 +86,6 @@ def test_the_time_that_this_computer_takes_counts_only_in_part(between_s: float,
     assert looks.seen[-1].dt_s == pytest.approx(counted_s)
 
 
-def test_a_computer_that_stalls_for_two_seconds_trips_no_guard() -> None:
-    cell = Cell(SensorGuard(Limits()), StallGuard(Limits()))
-    with cell.watched() as watcher:
-        cell.clock.advance(0.5)
-        cell.clock.stall(2.0)
-        cell.clock.advance(0.0)
-        cell.clock.advance(0.5)
-        watcher.check()
-    assert cell.trips == []
-
-
 # --------------------------------------------------------------------------------------------------- the sensor's age
 
 
@@ -113,20 +93,6 @@ def silent(sensor: FakeSensor) -> None:
     """Let the newest sample stay the newest."""
     newest = sensor.latest(timeout_s=0)
     sensor.latest = lambda **_: newest  # type: ignore[method-assign]  # this sensor only
-
-
-@pytest.mark.parametrize(("moving", "limit_s"), [(True, 0.1), (False, 0.5)])
-def test_a_sensor_that_falls_silent_stops_the_arm_in_time(moving: bool, limit_s: float) -> None:
-    cell = Cell(SensorGuard(Limits()))
-    with trips(15), cell.watched(moving=moving) as watcher:
-        cell.clock.advance(1.0)
-        watcher.check()
-        silent(cell.sensor)
-        silent_s = cell.clock.now_s()
-        cell.clock.advance(1.0)
-        assert cell.arm.halted.is_set()
-    ((stopped_s, _),) = cell.trips
-    assert stopped_s - silent_s == pytest.approx(limit_s, abs=0.021)  # seen at the next look but one
 
 
 # ----------------------------------------------------------------------------------------------- a stop, and its report
@@ -199,20 +165,6 @@ def test_an_arm_that_reports_nothing_for_a_second_was_out_of_sight(gone_s: float
         cell.clock.advance(gone_s)
         cell.arm.at_look = lambda: None
         assert watcher.unseen == unseen
-
-
-def test_two_short_silences_are_no_long_one() -> None:
-    def out_of_sight() -> None:
-        raise ConnectError("the arm is not open")
-
-    cell = Cell()
-    with cell.watcher as watcher:
-        for _ in range(3):
-            cell.arm.at_look = out_of_sight
-            cell.clock.advance(0.8)
-            cell.arm.at_look = lambda: None
-            cell.clock.advance(0.2)
-        assert not watcher.unseen
 
 
 def test_an_emergency_stop_is_seen_within_a_twentieth_of_a_second_while_the_arm_stands() -> None:
