@@ -35,6 +35,11 @@ def lose_controller(lab: Lab) -> None:
     lab.arm.gone = DeviceTimeout("silent")
 
 
+def heal_with_another_zero(lab: Lab) -> None:
+    lab.sensor.heals = True
+    push()(lab)
+
+
 def lose_sensor_and_heal(lab: Lab) -> None:
     lab.sensor.heals = True
     lose_sensor(lab)
@@ -160,6 +165,13 @@ STOPS = {
         {"move 4": press(Key.PAUSE), "hold": forbid_once},
         ("resume", "resume"),
         holds=((4, "paused"), (4, "the controller's safety limits forbid")),
+    ),
+    "a sensor that was switched off may have another zero": Case(
+        {"move 2": lose_sensor, "hold": heal_with_another_zero},
+        ("resume",),
+        rows=(15,),
+        holds=((2, "a cable came off"),),
+        noted={"not yet": 0},
     ),
     "a sensor that comes back while the arm stands needs no operator": Case(
         {"measuring 3": lose_sensor_and_heal}, rows=(15,), noted={"restarts": 1}
