@@ -29,16 +29,6 @@ def test_the_error_of_the_delay_is_as_its_sigma_says() -> None:
     assert 0.4 < np.sqrt(np.mean(np.square(left))) < 1.6
 
 
-def test_the_delay_does_not_depend_on_the_size_of_the_blocks() -> None:
-    rows, found = moved(0.004, 2.51, 0), []
-    for block in (2510, 700, 90):
-        estimator = DelayEstimator(calibrated(), P_FLANGE_SENSOR_M)
-        for i in range(0, len(rows), block):
-            estimator.add(rows.rows(slice(i, i + block)))
-        found.append((estimator.delay_s, estimator.sigma_s))
-    np.testing.assert_allclose(found, [found[0]] * 3, rtol=1e-9)
-
-
 def test_a_second_whose_push_looks_like_a_delay_does_not_count() -> None:
     for seconds, found in ((5.01, True), (2.01, False)):
         rows, estimator = moved(0.004, seconds, 0), DelayEstimator(calibrated(), P_FLANGE_SENSOR_M)

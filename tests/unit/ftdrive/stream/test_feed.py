@@ -69,15 +69,3 @@ def test_a_request_that_is_refused_is_a_line_on_the_screen() -> None:
     assert notes[0].text == "a torque about the tcp needs [sensor] height_mm"
     assert "use `ftdrive record" in notes[1].text
     assert len(blocks) == 2
-
-
-def test_each_reader_gets_every_block_and_note_and_one_that_is_late_costs_no_more_memory() -> None:
-    feed = SteppedFeed(FakeStream())
-    screen, page = feed.subscribe(), feed.subscribe()
-    feed.step(3)
-    page[0].clear()
-    feed.note("pushed")
-    assert len(screen[0]) == 3
-    assert [note.text for note in screen[1]] == [note.text for note in page[1]] == ["pushed"]
-    feed.step(2500)
-    assert len(screen[0]) < 2500

@@ -43,11 +43,6 @@ def test_white_noise_of_a_sample_and_of_a_reading_at_rest() -> None:
     assert noise.dof == 60 * 25 / 4
 
 
-def test_only_the_last_windows_count() -> None:
-    noise = known(learnt(np.vstack([3 * samples(1000, 2), samples(1504)])))
-    np.testing.assert_allclose(np.diag(noise.sample) / np.diag(TRUE), 1.0, atol=0.03)
-
-
 @pytest.mark.parametrize(("state", "size"), [(REST, 25), (1, 8)])
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_loud_window_and_a_jump_do_not_count(state: int, size: int, kept: bool) -> None:

@@ -91,18 +91,6 @@ def test_power_is_the_same_in_every_frame(axes: Axes, about: Point | tuple[float
     assert power == pytest.approx(wrench @ twist, rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize("axes", AXES)
-@pytest.mark.parametrize("about", POINTS)
-def test_rows_and_matrix_agree_and_can_be_undone(axes: Axes, about: Point | tuple[float, float, float]) -> None:
-    rng = np.random.default_rng(1)
-    R, wrench = Rotation.random(5, rng=rng).as_matrix(), rng.normal(size=(5, 6))
-    transform = FrameTransform(WrenchFrame(axes, about), info(calibrated()))
-    there = transform(wrench, R)
-    for i in range(5):
-        np.testing.assert_allclose(transform.matrix(R[i]) @ wrench[i], there[i], atol=1e-12)
-        np.testing.assert_allclose(np.linalg.solve(transform.matrix(R[i]), there[i]), wrench[i], atol=1e-10)
-
-
 def test_a_frame_needs_the_height_of_the_sensor() -> None:
     without = info(calibrated(), height=False)
     FrameTransform(WrenchFrame("base", "sensor"), without)
@@ -166,17 +154,6 @@ def test_a_lowpass_reduces_the_noise_as_its_sigma_says() -> None:
     assert stages_in_words(processor.settings) == "raw, bias, gravity, low-pass 40 Hz (Butterworth, order 2)"
 
 
-def test_a_switch_of_stages_has_no_transient() -> None:
-    push = np.array([0, 0, 20.0, 0, 0, 0])
-    processor = Processor(info(calibrated()), settings=Stages(lowpass_Hz=5.0))
-    run(processor, paired(still(0.3), push=push, noise=0.01))
-    processor.settings = Stages(gravity=False, lowpass_Hz=5.0)
-    weight = predict(TRUTH, UPSIDE_DOWN)[:3] - TRUTH.force_bias_N
-    block = run(processor, paired(still(0.3), push=push, noise=0.01))
-    np.testing.assert_allclose(block.wrench[:, :3] - weight, np.tile(push[:3], (300, 1)), atol=0.02)
-    assert next(event.kind for event in processor.take_events() if event.kind != "contact") == "stages"
-
-
 def test_an_impossible_filter_is_rejected() -> None:
     with pytest.raises(ConfigError, match="less than 500 Hz"):
         Processor(info(calibrated()), settings=Stages(lowpass_Hz=600.0))
@@ -189,14 +166,6 @@ def test_inertia_leaves_only_noise_of_a_moving_tool() -> None:
     assert (static.wrench.std(axis=0) > 4 * NOISE).all()
     assert dynamic.wrench.std(axis=0) == pytest.approx(NOISE, rel=0.1)
     assert len(static.seq) - len(dynamic.seq) <= 18  # milliseconds
-
-
-def test_repeated_times_delay_the_inertia_stage_only() -> None:
-    rows = moving(0.4)
-    coarse = replace(rows, t_host_ns=rows.t_host_ns // 20_000_000 * 20_000_000)
-    _, block = processed(coarse, settings=Stages(inertia=True))
-    assert len(block.seq) > 100
-    assert np.isfinite(block.wrench).all()
 
 
 def test_a_known_inertia_tensor_is_subtracted_too() -> None:
@@ -221,25 +190,16 @@ def test_a_known_inertia_tensor_is_subtracted_too() -> None:
 # -------------------------------------------------------------------------------------------------- noise and contact
 
 
-def test_a_free_tool_is_noise_and_no_contact() -> None:
-    processor, block = processed(paired(dwells(20, 1000, seed=7)), block=200)
-    assert np.sqrt(np.square(block.wrench).mean(axis=0)) == pytest.approx(NOISE, rel=0.05)
-    at_rest = block.chi2.reshape(20, 1000)[4:, 550:]
-    assert at_rest.mean() == pytest.approx(6.0, rel=0.2)
-    assert not block.in_contact.any()
-    assert kinds(processor) == []
-
-
 @pytest.mark.slow
 def test_false_alarms_are_as_rare_as_stated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(processing, "FALSE_ALARM_RATE", 0.01)
     alarms = readings = 0
-    for seed in range(8):
+    for seed in range(4):
         R = np.concatenate([np.repeat(dwells(1, 1, seed), 20_000, axis=0), dwells(100, 740, seed + 1000)])
         processor = Processor(info(calibrated(6, seed)))
         chi2 = processor.process(paired(R, seed=seed)).chi2[20_000:].reshape(100, 740)[:, 559::20].ravel()  # at rest
         alarms, readings = alarms + int((chi2 > processor.status(LINKS).contact_limit).sum()), readings + len(chi2)
-    assert readings == 8 * 1000
+    assert readings == 4 * 1000
     assert 0.003 < alarms / readings < 0.012
 
 
@@ -266,28 +226,6 @@ def test_a_contact_is_one_event_with_its_line_of_force() -> None:
     assert block.in_contact[1560:2100].all()
     assert not block.in_contact[1000:1540].any()
     assert not block.in_contact[2190:].any()
-
-
-def test_two_touches_with_a_short_pause_are_one_contact() -> None:
-    push = np.zeros((4000, 6))
-    for start in (1500, 1700, 3000):
-        push[start : start + 180, 2] = 8.0
-    processor, _ = processed(paired(still(4.0), push=push))
-    assert [round(event.values["duration_s"], 1) for event in processor.take_events()] == [0.4, 0.2]
-
-
-def test_a_contact_from_the_beginning_is_seen_when_the_noise_is_known() -> None:
-    _, block = processed(paired(still(1.5), push=np.array([0, 0, 2.0, 0, 0, 0])))
-    assert np.isnan(block.chi2[:400]).all()
-    assert block.in_contact[1200:].all()
-
-
-def test_noise_that_is_correlated_in_time_makes_no_alarms() -> None:
-    rng = np.random.default_rng(4)
-    slow = np.repeat(rng.normal(size=(800, 6)), 10, axis=0) * NOISE  # each value holds for 10 samples
-    _, block = processed(paired(still(8.0), push=slow, noise=0.1), block=100)
-    assert block.in_contact[2000:].mean() < 0.01
-    assert np.nanmean(block.chi2[2000:]) == pytest.approx(6.0, rel=0.25)
 
 
 def test_neither_the_filter_of_a_sensor_nor_drift_make_contacts_and_a_push_of_1_N_is_found_in_100_ms() -> None:
@@ -325,34 +263,14 @@ def test_a_moving_arm_with_a_free_tool_is_no_contact_from_its_first_motion_on() 
     assert not block.in_contact[9700:].any()
 
 
-@pytest.mark.parametrize("arm_Hz", [500, 125])
-def test_joint_noise_of_a_resting_arm_is_neither_motion_nor_noise_of_the_sensor(arm_Hz: int) -> None:
+def test_joint_noise_of_a_resting_arm_is_neither_motion_nor_noise_of_the_sensor() -> None:
+    arm_Hz = 500
     q_rad = HOME + 2e-5 * np.random.default_rng(8).normal(size=(6 * arm_Hz, 6))
     R, p = (np.repeat(poses, 1000 // arm_Hz, axis=0) for poses in flange(q_rad))
     at_rest = paired(np.tile(flange(HOME[None])[0], (6000, 1, 1)))
     _, block = processed(replace(at_rest, R_base_flange=R, p_base_flange_m=p))
     assert block.sigma == pytest.approx(NOISE, rel=0.1)
     assert np.mean(block.chi2[2000:]) == pytest.approx(6.0, rel=0.2)
-
-
-def test_a_hand_on_the_tool_does_not_make_the_noise_larger() -> None:
-    rng = np.random.default_rng(5)
-    hand = np.zeros((12000, 6))
-    hand[6000:9000] = np.cumsum(rng.normal(size=(3000, 6)), axis=0) * 0.05
-    _, block = processed(paired(still(12.0), push=hand), block=100)
-    assert block.sigma == pytest.approx(NOISE, rel=0.1)
-
-
-def test_lost_samples_are_events() -> None:
-    rows = paired(still(0.3))
-    kept = np.ones(300, bool)
-    kept[[100, 101, 205]] = False
-    processor, _ = processed(rows.rows(kept))
-    events = processor.take_events()
-    assert [(event.kind, event.values["lost"], event.values["seq"]) for event in events] == [
-        ("gap", 2, 102),
-        ("gap", 1, 206),
-    ]
 
 
 # ------------------------------------------------------------------------------------------------------ tare and drift
@@ -394,12 +312,6 @@ def test_a_tare_is_refused_with_a_hand_on_the_tool(push: Array, why: str) -> Non
 def test_a_tare_is_refused_while_the_arm_moves() -> None:
     processor, _ = processed(moving(1.0))
     assert "the arm moves" in processor.tare().text
-
-
-def test_a_tare_without_samples_is_refused() -> None:
-    assert Processor(info(calibrated())).tare().kind == "tare-refused"
-    processor, _ = processed(paired(still(0.1)))
-    assert "only 100 samples" in processor.tare().text
 
 
 def test_the_bias_follows_the_temperature_in_small_steps_and_events_in_large_ones() -> None:

@@ -4,9 +4,8 @@ import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -190,15 +189,6 @@ def test_a_plot_has_the_samples_from_its_call_on(cell: Cell) -> None:
         assert np.std(line.get_ydata()) == pytest.approx(NOISE[0], rel=0.2)
 
 
-def test_samples_name_axes_point_and_uncertainty(cell: Cell) -> None:
-    with cell.stream(frame=WrenchFrame("base", "flange")) as stream:
-        sample = next(islice(stream, 1100, None))
-    assert str(sample.frame) == "base axes, about the flange"
-    assert sample.force_sigma_N == pytest.approx(NOISE[:3], rel=0.2)
-    assert np.abs(sample.force_N).max() < 6 * NOISE[0]
-    assert sample.t_s == pytest.approx(cell.clock.now_s(), abs=0.05)
-
-
 @pytest.mark.parametrize("device", ["sensor", "arm"])
 def test_a_silent_device_raises_and_recovers_with_events(cell: Cell, device: str) -> None:
     link: Link = getattr(cell, device)
@@ -229,15 +219,6 @@ def test_another_device_after_an_interruption_is_refused(cell: Cell) -> None:
         cell.sensor.info = DeviceInfo("model", "other", "1")
         with pytest.raises(ConfigError, match="another device"):
             stream.read()
-
-
-def test_a_calibration_of_another_sensor_is_refused(cell: Cell) -> None:
-    made_with = {
-        "devices": {"sensor": {"model": "model", "serial": "S2"}, "arm": {"model": "model", "serial": "serial"}}
-    }
-    cell.calibration = replace(cell.calibration, provenance=made_with)
-    with pytest.raises(ConfigError, match="S2"), cell.stream():
-        pass
 
 
 def test_a_calibration_of_another_sensor_or_mount_is_applied_if_forced(cell: Cell) -> None:
@@ -313,38 +294,6 @@ def test_a_device_that_sends_nothing_is_named(cell: Cell) -> None:
         pass
 
 
-def test_the_delay_is_configured_or_found(cell: Cell) -> None:
-    cell.sensor.motion = cell.arm.motion = Motion()
-    cell.sensor.begin_ns += 8_000_000  # the wrench comes 8 ms after the pose of the same time
-    with cell.stream() as stream:
-        until(stream, lambda: 0 < stream.status().delay_sigma_s < 5e-4)
-        until(stream, lambda: abs(stream.status().delay_s - 0.008) < 1e-3)
-    cell.config = replace(cell.config, sensor=replace(cell.config.sensor, delay_ms=8.0))
-    with cell.stream() as stream:
-        stream.read()
-        assert (stream.status().delay_s, stream.status().delay_sigma_s) == (0.008, 0.0)
-
-
-def test_frame_stages_marks_and_tare_are_events(cell: Cell) -> None:
-    with cell.stream() as stream:
-        until(stream, lambda: bool(np.isfinite(stream.read().sigma).all()))
-        stream.frame = WrenchFrame("base", "tcp")
-        stream.stages = Stages(lowpass_Hz=40.0)
-        block = stream.read()
-        stream.mark("peg in")
-        stream.tare()
-        status = stream.status()
-        stream.undo_tare()
-        kinds = [event.kind for event in stream.take_events()]
-    assert (block.frame, block.stages) == (WrenchFrame("base", "tcp"), Stages(lowpass_Hz=40.0))
-    assert kinds == ["frame", "stages", "mark", "tare", "tare-undone"]
-    assert status.tare is not None
-    assert np.abs(status.tare).max() < 0.05
-    assert status.tare_t_host_ns == block.t_host_ns[-1]
-    assert status.sensor.lost == 3
-    assert status.contact_limit > 22
-
-
 def test_a_contact_is_called_back_once_when_it_begins_and_once_when_it_ends(cell: Cell) -> None:
     contacts: list[Contact] = []
     with open_stream(cell.config, cell.calibration, on_contact=contacts.append) as stream:
@@ -357,13 +306,6 @@ def test_a_contact_is_called_back_once_when_it_begins_and_once_when_it_ends(cell
     assert [contact.over for contact in contacts] == [False, True]
     assert contacts[1].t_s == contacts[0].t_s
     np.testing.assert_allclose(contacts[1].direction, [0, 0, -1], atol=0.03)
-
-
-def test_devices_of_the_user_take_the_place_of_those_in_the_configuration(cell: Cell) -> None:
-    mine = Sensor(cell.clock, RATE_HZ), Arm(cell.clock, ARM_HZ)
-    with open_stream(cell.config, cell.calibration, sensor=cast(Any, mine[0]), arm=cast(Any, mine[1])) as stream:
-        assert len(stream.read())
-    assert [device.opened for device in (*mine, cell.sensor, cell.arm)] == [1, 1, 0, 0]
 
 
 def test_an_emulated_cell_excludes_a_real_one(cell: Cell) -> None:

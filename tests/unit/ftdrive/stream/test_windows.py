@@ -1,13 +1,12 @@
 """Windows of the tracker in motion, against the mechanics of the simulated tool."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ftcalib.model import Array, skew
-from ftdrive.stream.noise import REST, SensorNoise, Window, Windows
+from ftdrive.stream.noise import SensorNoise, Window, Windows
 from ftdrive.stream.samples import Paired
 from tests.unit.ftdrive.stream.simulated import (
     P_FLANGE_SENSOR_M,
@@ -80,27 +79,3 @@ def test_a_window_has_the_motion_of_the_sensor() -> None:
         assert window.state == 3
         np.testing.assert_allclose(window.R_base_flange, motion.pose(t_s[150:151])[0][0])
         assert window.systematic is SYSTEMATIC
-
-
-def test_inertia_counts_in_motion_only_and_a_window_without_all_samples_is_left_out() -> None:
-    motion = Motion(0.0, 2.0)
-    rows = moving(0.6, motion, noise=0.0)
-    at_rest, in_motion = windows(rows, REST)[0], windows(rows, 1)[0]
-    assert np.linalg.norm(at_rest.residual[:3]) > 10 * np.linalg.norm(in_motion.residual[:3])
-    late = replace(rows, t_host_ns=T0_NS + (rows.t_host_ns - T0_NS) * 13 // 10)
-    assert not windows(late, REST)
-    hardly_late = replace(rows, t_host_ns=T0_NS + (rows.t_host_ns - T0_NS) * 11 // 10)
-    assert len(windows(hardly_late, REST)) == 2
-
-
-def test_without_positions_an_acceleration_is_not_known() -> None:
-    rows = moving(0.4, Motion(0.5, 0.0), noise=0.0)
-    unknown = replace(rows, p_base_flange_m=np.full((len(rows), 3), np.nan))
-    (known,), (window,), (still,) = windows(rows, 2), windows(unknown, 2), windows(unknown, REST)
-    extra = np.zeros((6, 6))
-    for axis in np.eye(3):
-        force_N = MASS_KG * axis * 1.0
-        pull = np.r_[force_N, np.cross(TRUTH.p_sensor_com_m, force_N)]
-        extra += np.outer(pull, pull)
-    np.testing.assert_allclose(window.noise - known.noise, extra, atol=0.01)
-    np.testing.assert_array_equal(still.noise, known.noise)
