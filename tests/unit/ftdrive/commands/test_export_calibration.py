@@ -1,10 +1,7 @@
 """`ftdrive export calibration` and `ftdrive export formats`: options, the run's configuration, JSON, files."""
 
 import json
-from contextlib import nullcontext
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -49,34 +46,6 @@ def test_formats_are_listed_for_people_and_programs() -> None:
     assert len(export("formats").stdout.splitlines()) == len(FORMATS)
 
 
-def test_text_goes_to_stdout_and_notes_to_stderr(saved: Path) -> None:
-    outcome = export("calibration", saved, "--format", "ft-tools")
-    assert outcome.exit_code == 0
-    assert yaml.safe_load(outcome.stdout)["mass"] == pytest.approx(2.0)
-    assert "gravity_in_reference_frame = [0, 0, -9.80665]" in " ".join(outcome.stderr.split())
-
-
-def test_the_mass_of_an_emulated_sensor_is_that_of_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = {"sensor": {"url": "x", "height_mm": 0.0, "mass_kg": 0.25}}
-    folder = Run.create(tmp_path, "simulated", {"config": config}).folder
-    calibration().save(folder / "calibration.json")
-    monkeypatch.setattr(
-        import_module("ftdrive.commands.export.calibration"), "rehearsed_run", lambda *_: nullcontext(folder)
-    )
-    outcome = export("calibration", "--simulate", "--format", "franka")
-    assert yaml.safe_load(outcome.stdout)["mass"] == pytest.approx(2.25)
-
-
-def test_json_has_text_notes_and_what_is_set_elsewhere(saved: Path) -> None:
-    answer = json.loads(export("calibration", saved, "--format", "ft-tools", "--json").stdout)
-    assert (answer["schema_version"], answer["format"], answer["file"]) == (1, "ft-tools", None)
-    assert answer["calibration"] == calibration().id
-    assert answer["elsewhere"]["calibration.reference_frame.id"] == "base"
-    assert answer["max_force_error_N"] == 0
-    assert len(answer["notes"]) == 4
-    assert yaml.safe_load(answer["text"])["mass"] == pytest.approx(2.0)
-
-
 def test_a_file_is_new_and_complete_or_absent(saved: Path, tmp_path: Path) -> None:
     path = tmp_path / "ft.yaml"
     first = export("calibration", saved, "--format", "admittance", "-o", path)
@@ -105,38 +74,10 @@ def test_height_and_mass_come_from_the_run_unless_an_option_has_them(run: Path, 
     assert isinstance(alone.exception, ConfigError)
 
 
-def test_a_calibration_file_that_still_lies_in_its_run_has_its_configuration(run: Path) -> None:
-    def named(name: str) -> dict[str, Any]:
-        document = calibration().to_dict()
-        document["provenance"] = {"run": name, "setup": {"sensor_mass_kg": 0.25}}
-        return document
-
-    (run / "mine.json").write_text(json.dumps(named(run.name)))
-    assert height_m(export("calibration", run / "mine.json", "--format", "static-transform")) == pytest.approx(0.04)
-    (run / "other.json").write_text(json.dumps(named("another")))
-    other = export("calibration", run / "other.json", "--format", "static-transform")
-    assert isinstance(other.exception, ConfigError)
-    options = "--height", "0", "--sensor-com", "0,0,20"
-    payload = export("calibration", run / "other.json", "--format", "franka", *options)
-    assert yaml.safe_load(payload.stdout)["mass"] == pytest.approx(2.25)  # the result names the mass itself
-
-
-def test_names_of_frames_are_options(saved: Path) -> None:
-    frames = "--base-frame", "world", "--sensor-frame", "ft", "--tool-frame", "gripper"
-    found = yaml.safe_load(export("calibration", saved, "--format", "kth", *frames).stdout)
-    assert (found["gripper_com_frame_id"], found["gripper_com_child_frame_id"]) == ("ft", "gripper")
-
-
 def test_three_numbers_are_wanted_for_a_place(saved: Path) -> None:
     outcome = export("calibration", saved, "--format", "franka", "--height", "1", "--sensor-com", "0,0")
     assert isinstance(outcome.exception, ConfigError)
     assert "--sensor-com is '0,0'" in str(outcome.exception)
-
-
-def test_an_unknown_format_is_a_usage_error_that_lists_the_known(saved: Path) -> None:
-    outcome = export("calibration", saved, "--format", "kht")
-    assert outcome.exit_code == 2
-    assert all(name in outcome.stderr for name in FORMATS)
 
 
 def test_the_last_verification_stands_in_the_file_and_a_failed_one_in_a_note(run: Path, tmp_path: Path) -> None:

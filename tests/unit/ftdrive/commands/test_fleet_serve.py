@@ -77,7 +77,7 @@ def test_another_address_is_said_to_be_unprotected(run: Callable[..., Ran], monk
     assert "Unprotected: any computer that reaches port" in run("--metrics", "0.0.0.0:0")[1]
 
 
-@pytest.mark.parametrize("address", ["10018", ":10018", "localhost:", "localhost:x", "localhost:65536"])
+@pytest.mark.parametrize("address", ["10018", "localhost:x", "localhost:65536"])
 def test_a_wrong_address_is_refused(address: str, run: Callable[..., Ran]) -> None:
     code, said = run("--metrics", address)
     assert (code, f"--metrics is '{address}': give HOST:PORT, such as 127.0.0.1:10018" in said) == (2, True)

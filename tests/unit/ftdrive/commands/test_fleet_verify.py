@@ -116,7 +116,7 @@ def lab(indexed: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPat
     return Lab(*indexed, monkeypatch)
 
 
-@pytest.mark.parametrize("terminals", ["", "i", "e"])
+@pytest.mark.parametrize("terminals", ["", "e"])
 def test_without_a_terminal_nothing_is_asked_and_nothing_moves(terminals: str, lab: Lab) -> None:
     code, out, err = lab.run(terminals=terminals)
     assert (code, out, lab.asked, lab.sessions) == (2, [], [], [])
@@ -134,27 +134,6 @@ def test_only_yes_starts_a_session(no: str | Exception, lab: Lab) -> None:
     assert lab.asked == ["A", "B", "C"]
     assert lab.verified == ["B"]
     assert out == ["A: skipped", "B: passed", "C: skipped"]
-
-
-def test_the_session_is_that_of_verify_with_its_questions(lab: Lab) -> None:
-    lab.run("B", answers=["yes"])
-    ((cell, path, options),) = lab.sessions
-    assert cell.robot.host == "10.0.0.66"
-    assert cell.store.url == lab.url
-    assert path == lab.folder / "B/runs/run-B/calibration.json"
-    assert options.runs == lab.folder / "B/runs"
-    assert (options.name, options.mode, options.yes, options.fast, options.questions) == (
-        "verify",
-        "auto",
-        False,
-        False,
-        True,
-    )
-
-
-def test_the_named_cells_are_asked_about_in_their_order(lab: Lab) -> None:
-    lab.run("C", "A", "C", answers=["", ""])
-    assert lab.asked == ["C", "A"]
 
 
 def test_only_cells_that_are_due(lab: Lab) -> None:

@@ -19,7 +19,6 @@ from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, user_fold
 from ftdrive.commands.options import CellOptions, SourceOptions
 from ftdrive.runs.run import Run
 from ftdrive.runs.weighings import FOLDER, append_weighings
-from ftdrive.store import index_run
 from ftdrive.store.database import SCHEMA, default_file
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.store.run_folders import new_run, result, verified
@@ -99,16 +98,6 @@ def test_the_last_weighing_of_each_tool_is_a_line_and_days_are_a_table(run: Call
     assert found[-1]["refusals"]["cable"] == 2
     assert json.loads(run("history", "--json")[1])["last_weighings"][0]["mass_kg"] == 0.227
     assert run("history", runs, "--weighings")[0] == 2
-
-
-def test_a_day_without_a_weighing_has_no_line(run: Callable[..., Ran], runs: Path) -> None:
-    run("history", "--index", runs)
-    day = datetime.now(UTC).date().isoformat()
-    origin: dict[str, Any] = {"tool": "welder", "arm_serial": "1"}
-    append_weighings(user_folder("data") / FOLDER, origin, day, [{"refused": "cable"}])
-    run("history", "--index", user_folder("data") / FOLDER)
-    assert len(json.loads(run("history", "--json")[1])["last_weighings"]) == 1
-    assert "last weighing" not in run("history")[1]
 
 
 def test_rebuilt_a_deleted_run_is_gone_and_a_damaged_one_is_named(run: Callable[..., Ran], runs: Path) -> None:
@@ -233,14 +222,6 @@ def test_a_calibration_never_fails_for_the_store_and_is_caught_up(
     assert not default_file().exists()
 
 
-@pytest.mark.parametrize("url", ["mysql://host/db", "sqlite:////dev/null/store.sqlite", "store"])
-def test_a_bad_address_is_a_warning_after_a_calibration(url: str, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FTDRIVE_STORE_URL", url)
-    said = list[str]()
-    index_run(runs / "gripper-0", said.append)
-    assert said[0].startswith(" The run is saved, but not yet in the history, because ")
-
-
 def test_a_result_that_solve_saves_in_its_run_is_indexed(
     run: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -253,7 +234,7 @@ def test_a_result_that_solve_saves_in_its_run_is_indexed(
     assert len(Store().results()) == 2
 
 
-@pytest.mark.parametrize("command", [["live"], ["stream"], ["record", "-o", "a.csv"], ["weigh"], ["serve-load"]])
+@pytest.mark.parametrize("command", [["record", "-o", "a.csv"], ["weigh"]])
 @pytest.mark.parametrize(
     ("more", "words"),
     [

@@ -14,13 +14,10 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from ftcalib import CalibrationDataset, Known, Parameters, Setup, solve
-from ftcalib.model import SPECIAL_R_flange_base, predict
 from ftdrive.checks.check import Check
 from ftdrive.commands import live
 from ftdrive.stream.feed import Feed
-from ftdrive.stream.processing import Processor
-from ftdrive.stream.samples import Links, Stages, WrenchFrame
+from ftdrive.stream.samples import Links, WrenchFrame
 from ftdrive.stream.sources import Read, RecordingSource
 from ftdrive.stream.stream import Stream
 from ftdrive.terminal import live_panels
@@ -81,23 +78,6 @@ def test_axes_and_point_are_chosen_separately(arguments: list[str]) -> None:
     assert (base["axes"], base["about"], point["about"]) == ("base", "sensor origin", [0.0, 0.0, 0.13])
     as_measured = json.loads(run(arguments, "--json", "--once", "--stages", "bias=false,gravity=false").stdout)
     np.testing.assert_allclose(as_measured["compensated"]["force_N"], sensor["raw"]["force_N"], atol=1e-9)
-
-
-def test_once_prints_one_line(arguments: list[str]) -> None:
-    (line,) = run(arguments, "--once").stdout.splitlines()
-    assert re.fullmatch(
-        r"F( +-?\d+\.\d{3}){3} N   T( +-?\d+\.\d{5}){3} N·m   \(sensor axes, about the sensor origin\)", line
-    )
-
-
-def test_a_file_gets_a_line_for_each_reading(arguments: list[str]) -> None:
-    for more in (["--plain"], []):
-        result = run(arguments, *more)
-        lines = result.stdout.splitlines()
-        assert len(lines) == pytest.approx(11, abs=2)
-        assert all(re.match(r"\d+\.\d s   F( +-?\d+\.\d{3}){3} N   T", line) for line in lines)
-        assert lines[-1].endswith("(sensor axes, about the sensor origin)   contact")
-        assert "F " not in result.stderr
 
 
 class Quiet:
@@ -176,27 +156,3 @@ def test_a_failure_that_lasts_ends_the_command() -> None:
         stream.source.failures = failures  # type: ignore[attr-defined]
         with pytest.raises(DeviceTimeout):
             list(StreamSummary(Feed(stream)).views(raises=raises))
-
-
-def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
-    truth = Parameters(np.eye(3), np.array([0.1, -0.2, -5.0]), np.zeros(3), np.array([0.0, 0.0, 0.05]), np.zeros(3))
-    R = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
-    off = np.random.default_rng(1).normal(size=(24, 6)) * np.repeat([0.02, 0.001], 3)  # ten times the measured noise
-    cov = np.tile(np.diag(np.repeat([2e-3, 1e-4], 3) ** 2), (24, 1, 1))
-    known = Known(mass_kg=0.6)  # too much
-    calibration = solve(
-        CalibrationDataset(R, predict(truth, R) + off, cov, np.zeros(24, np.int64), np.full(24, np.nan)),
-        known=known,
-        setup=Setup(orientation_accuracy_deg=0.0),
-    )
-    headline = calibration.likely_error()
-    assert (headline > 1.1 * np.array(calibration.predicted_error())).all()
-    shown = []
-    for one in R:
-        processor = Processor(replace(info(calibration), result=calibration), WrenchFrame("base"), Stages())
-        rows = paired(np.tile(one, (1000, 1, 1)), noise=1e-3)
-        processor.process(rows)
-        shown.append(processor.sigma_of_mean(one, 0.1, loaded=False))
-    rms = np.sqrt(np.square(shown).reshape(24, 2, 3).sum(axis=2).mean(axis=0))
-    np.testing.assert_allclose(rms, headline, rtol=0.01)
-    assert np.min(np.array(shown)[:, :3]) > 0.5 * headline[0] / np.sqrt(3)

@@ -5,15 +5,11 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from ftcalib import CalibrationResult
-from ftdrive.recording import Recorder, load_recording
-from ftdrive.recording.recording import with_calibration
-from ftdrive.runs.bundle import write_bundle
-from ftdrive.runs.run import Run
+from ftdrive.recording import Recorder
 from tests.calibrated_runs import calibrated_run
 from tests.unit.ftdrive.recorded import block, calibration, info
 
@@ -69,14 +65,6 @@ def test_an_edited_calibration_is_refused_unless_it_is_forced_and_then_marked(
     assert json.loads(out)["marks"] == ["EDITED BY HAND"]
 
 
-def test_a_file_made_with_an_edited_calibration_says_so(run: Callable[..., Ran]) -> None:
-    add_6_N()
-    assert run(*USES["compensate"], "--force", "-o", "new.csv")[0] == 0
-    assert load_recording(Path("new.csv")).header.info.marks == ("EDITED BY HAND",)
-    assert "EDITED BY HAND" in Path("new.csv").read_text(encoding="utf-8").partition("\n")[0]
-    assert run("compensate", "new.csv")[1].startswith(" The file was EDITED BY HAND")
-
-
 @pytest.mark.parametrize("words", [["report", "c.json", "--format", "json"], ["diff", "c.json", "c.json"]])
 def test_nothing_calls_an_edited_calibration_good(words: list[str], run: Callable[..., Ran]) -> None:
     add_6_N()
@@ -122,29 +110,3 @@ def test_every_output_of_an_emulated_calibration_says_so(
     assert run("compensate", "peg.csv", "--calibration", "d.json")[1].startswith(" The cell was EMULATED")
     _, out, _ = run("live", "--replay", "peg.csv", "--calibration", "d.json", "--once", "--json")
     assert json.loads(out)["marks"] == ["EMULATED"]
-
-
-def test_a_real_calibration_is_not_marked(run: Callable[..., Ran]) -> None:
-    assert "EMULATED" not in run("export", "calibration", "c.json", "--format", "ros2-control")[1]
-    assert json.loads(run("compensate", "peg.csv", "--calibration", "c.json", "--json")[1])["marks"] == []
-
-
-def test_a_recording_of_an_emulated_cell_says_so_whatever_its_calibration(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    recorder = Recorder([path], replace(info(), emulated=True), {})
-    recorder.add(block(3), [])
-    recorder.end()
-    found = load_recording(path)
-    assert found.header.info.marks == ("EMULATED",)
-    assert with_calibration(found.header, calibration(), "c.json").info.marks == ("EMULATED",)
-
-
-def test_a_bundle_names_an_emulated_run(tmp_path: Path) -> None:
-    import zipfile
-
-    for name, header in (("e", {"station": {"sensor": "can"}}), ("r", {})):
-        folder = calibrated_run(tmp_path / "runs", name, SEED if header else 1, header=header)
-        write_bundle(Run(folder).folder, tmp_path / f"{name}.zip")
-        with zipfile.ZipFile(tmp_path / f"{name}.zip") as archive:
-            about: dict[str, Any] = json.loads(archive.read("bundle.json"))
-        assert about["emulated"] is (name == "e")

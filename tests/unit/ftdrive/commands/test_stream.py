@@ -57,7 +57,7 @@ def test_an_address_that_others_reach_is_said_to_be_unprotected(
     assert "ws://0.0.0.0" not in printed
 
 
-@pytest.mark.parametrize("udp", ["9870", "host:", "host:x", "host:70000", ":9870"])
+@pytest.mark.parametrize("udp", ["9870", "host:x", "host:70000"])
 def test_a_wrong_udp_address_is_refused_before_any_work(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, udp: str
 ) -> None:

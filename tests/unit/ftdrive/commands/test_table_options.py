@@ -15,7 +15,6 @@ from tests.unit.ftdrive.tables.test_layouts import POSES, columns, quaternion, t
 
 Solved = Callable[..., tuple[int, str, str]]
 PLAIN = t(POSES) | wrench(POSES) | quaternion(POSES)
-TCP = "0.02,-0.01,0.15,0.1,0.2,0.3"
 
 
 @pytest.fixture
@@ -89,13 +88,6 @@ def test_the_sign_reverses_what_is_read(solved: Solved) -> None:
     near(parameters(solved(reaction, "--sign", "-1")), parameters(solved(PLAIN)))
 
 
-def test_poses_of_a_tcp_are_led_back_to_the_flange(solved: Solved) -> None:
-    names = "x y z rx ry rz"
-    R = POSES.R * type(POSES.R).from_rotvec([0.1, 0.2, 0.3])
-    poses = columns(names, np.hstack([POSES.p_m + POSES.R.apply([0.02, -0.01, 0.15]), R.as_rotvec()]))
-    near(parameters(solved(t(POSES) | wrench(POSES) | poses, "--tcp", TCP)), parameters(solved(PLAIN)))
-
-
 def test_a_urdf_makes_poses_of_joint_angles(tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf"
     path.write_text(URDF)
@@ -110,17 +102,12 @@ def test_a_urdf_makes_poses_of_joint_angles(tmp_path: Path) -> None:
     ("options", "words"),
     [
         (["--columns", "fx"], "--columns fx: give NAME=COLUMN separated by commas"),
-        (["--columns", "none.toml"], "none.toml"),
         (["--columns", "empty.toml"], "empty.toml has no columns"),
         (["--columns", "fx=Force"], "the columns are t, fx, fy"),
         (["--tcp", "1,2"], "--tcp is '1,2': give 3 or 6 numbers"),
         (["--euler", "xy"], "--euler xy: give rpy, ABC"),
-        (["--rate", "0"], "--rate"),
-        (["--sign", "2"], "--sign"),
         (["--model", "UR99"], "--model UR99: the models are UR3"),
         (["--model", "ur5e", "--urdf", "a.urdf"], "--model and --urdf both describe the arm"),
-        (["--urdf", "none.urdf"], "--urdf none.urdf: none.urdf is not a URDF"),
-        (["--urdf", "arm.urdf?flange=tip"], "has no link 'tip'"),
         (["--urdf", "arm.urdf"], "7 moving joints, not 6"),
         (["--wrench-topic", "/ft"], "are only for a ROS bag"),
     ],

@@ -17,7 +17,6 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.verification import NO_LIMITS, Limits, Verified
 from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.verifying import Verifying, save_wanted_update
-from ftdrive.words.result import verification_in_lines
 from tests.unit.ftdrive.recorded import calibration
 
 
@@ -65,13 +64,6 @@ def failed(folder: Path, limits: Limits) -> Any:
     )
     path = folder / "verification.json"
     return Verified(Run(folder), calibration(), folder / "a.json", limits, None, (), found, None, path)  # type: ignore[arg-type]
-
-
-def test_the_limits_that_decide_are_named(tmp_path: Path) -> None:
-    words = [verification_in_lines(failed(tmp_path, limits))[0].words for limits in (NO_LIMITS, (1.0, 0.1))]
-    assert "p 1e-09 (false alarms: 1 in 100, near the poses of the fit)" in words[0]
-    assert words[1] == "largest difference 0.52 N, 0.52 N·m; limit 1 N, 0.1 N·m"
-    assert failed(tmp_path, (1.0, 0.1)).exceeded == ("0.52 N·m is above --max-torque 0.1 N·m",)
 
 
 @pytest.mark.parametrize(

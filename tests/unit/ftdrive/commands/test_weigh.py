@@ -73,17 +73,6 @@ def test_each_new_weight_and_fault_is_a_line(monkeypatch: pytest.MonkeyPatch) ->
     assert [line.split()[0] for line in weighed(scale, monkeypatch)[1].splitlines()] == ["nothing:", "not", "0.8123"]
 
 
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [((), "nothing:"), (("--poses", "2"), "0.3000 "), (("--zero",), "0.8123 ")],
-    ids=["one", "poses", "zero"],
-)
-def test_once_ends_with_the_first_weight(options: tuple[str, ...], line: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    scale = Scale((CABLE, True), (EMPTY, True), (ONE, True), (TWO, True), (ONE, True))
-    (printed,) = weighed(scale, monkeypatch, "--once", *options)[1].splitlines()
-    assert printed.startswith(line)
-
-
 def test_once_gives_up_after_ten_seconds_unless_it_waits_for_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
     late = [(MOVING, False)] * 10
     assert weighed(Scale(*late[:-1], (ONE, True)), monkeypatch, "--once")[1]
