@@ -16,16 +16,6 @@ def test_the_bits_are_those_of_unicode() -> None:
         assert characters(dots)[0, 0] == chr(0x2800 + code)
 
 
-def test_noise_about_zero_is_one_line() -> None:
-    assert drawn([-0.01, 0.01], [0.01, 0.02], 1, 1.0) == ["⠤"]
-    assert drawn([-0.01] * 2, [0.01] * 2, 3, 1.0) == [" ", "⠤", " "]
-
-
-def test_the_edges_hold_what_is_larger() -> None:
-    assert drawn([5.0, 5.0], [9.0, 9.0], 2, 1.0) == ["⠉", " "]
-    assert drawn([-9.0, -9.0], [-5.0, -5.0], 2, 1.0) == [" ", "⣀"]
-
-
 def test_a_step_is_joined_and_a_gap_is_not() -> None:
     assert drawn([-1.0, 1.0], [-1.0, 1.0], 1, 1.0) == ["⣸"]
     assert drawn([0.0, np.nan, 0.0, 0.0], [0.0, np.nan, 0.0, 0.0], 1, 1.0) == ["⠄⠤"]

@@ -13,7 +13,6 @@ from contextlib import nullcontext
 import pytest
 
 from ftdrive.terminal.canvas import Canvas
-from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.lines import Line
 from tests.unit.ftdrive.terminal.test_screen import Shown, terminal
 from tests.wire.waiting import wait_until
@@ -92,22 +91,6 @@ def test_lines_that_changed_are_sent_until_q_and_then_what_was_printed() -> None
     assert (canvas.heard, first.count("always the same"), again.count("always the same")) == (["x"], 2, 1)
     assert first.count("\x1b[1;1H") >= 5
     assert text.index("a warning") > text.index(LEFT)
-
-
-def test_strokes_are_characters_and_names_of_keys() -> None:
-    heard: list[str] = []
-
-    def hears(*strokes: str) -> bool:
-        heard.extend(iter(keyboard.stroke, None))
-        return heard[-len(strokes) :] == list(strokes)
-
-    with terminal() as (person, program), Keyboard(program) as keyboard:
-        os.write(person, b"aA ?\xc3")  # amid a character
-        wait_until(lambda: hears(*"aA ?"))
-        os.write(person, b"\xa9\x1b[D\x1bOC\x7f\n\x1b[5~\x04\x1b[1;2Aq")  # page up, Ctrl-D and shift-up are no strokes
-        wait_until(lambda: hears("?", "é", "left", "right", "backspace", "enter", "q"))
-        os.write(person, b"\x1b")
-        wait_until(lambda: hears("q", "escape"))
 
 
 def test_the_key_v_shows_the_code_of_the_page_until_a_key(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,10 +12,6 @@ def _started_by_uv(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UV_RUN_RECURSION_DEPTH", "1")
 
 
-def test_without_uv_nothing_changes() -> None:
-    assert as_typed("run `ftdrive plan`") == "run `ftdrive plan`"
-
-
 @pytest.mark.parametrize(
     ("words", "typed"),
     [

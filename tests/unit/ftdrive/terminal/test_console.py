@@ -71,7 +71,7 @@ def test_what_is_longer_than_the_terminal_goes_on_under_its_first_word(width: in
     assert indented("head: ", words, Console(width=width, soft_wrap=True)).plain == f"head: {words}"  # a file
 
 
-@pytest.mark.parametrize("before", range(20))
+@pytest.mark.parametrize("before", [0, 7, 14])
 def test_a_command_in_backticks_stays_whole(before: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((40, 24)))
     monkeypatch.setattr(sys.stderr, "fileno", lambda: 2, raising=False)
@@ -91,14 +91,6 @@ def test_help_breaks_no_address_and_cuts_no_sentence() -> None:
     assert "or play them to the driver" in run("transcript", "--help").stdout
     for command in ("export", "fleet", "loads", "transcript", "config"):
         assert "..." not in run(command, "--help").stdout.replace("[ARGS]...", "")
-
-
-def test_a_line_that_is_a_command_is_never_broken() -> None:
-    console = Console(width=40, file=io.StringIO(), color_system=None)
-    command = "ftdrive calibrate --resume /home/operator/cells/left/runs/2026-11-28T040528Z-calibrate"
-    console.print(indented("   ", f"kept in a folder; after a stop, continue with\n{command}", console), soft_wrap=True)
-    assert isinstance(console.file, io.StringIO)
-    assert command in console.file.getvalue()
 
 
 def test_quiet_leaves_only_errors_and_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,9 +224,8 @@ def test_a_terminal_that_closes_ends_a_command_unless_it_may(ignored: bool, monk
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
-@pytest.mark.parametrize("arguments", [["export", "formats"], ["--help"]], ids=" ".join)
-def test_a_closed_pipe_ends_a_command_quietly(arguments: list[str]) -> None:
-    assert ended(MAIN, *arguments) == (141, "")
+def test_a_closed_pipe_ends_a_command_quietly() -> None:
+    assert ended(MAIN, "--help") == (141, "")
 
 
 def test_a_broken_pipe_of_a_device_is_no_closed_output(

@@ -51,9 +51,7 @@ PUSHES = {
     "inertia": replace(PUSH, new=INERTIA),
     "restored": RESTORED,
     "leans": leaning(0.0, 0.0, 9.82, sent=False),
-    "leans-perhaps": leaning(0.0, 0.0, 9.82, significant=False, sent=False),
     "leans-sent": leaning(0.0, 0.008, 9.82),
-    "leans-sent-tilted": leaning(0.0, 0.0095, 9.82),
     "leans-sent-inverted": leaning(0.0, 0.0, -9.82),
     "leans-not-reported": leaning(),
 }

@@ -40,16 +40,6 @@ def test_no_word_is_ever_broken(columns: int, printed: Printed) -> None:
     assert words <= {word for line in printed(columns)[1:] for word in line.split()}
 
 
-def test_a_narrow_terminal_folds_only_what_may_be_folded(printed: Printed) -> None:
-    _, *lines = (line.rstrip() for line in printed(30))
-    assert lines == [
-        "press-4  a gripper      now",
-        "         with a long",
-        "         name",
-        "b                       in 5 d",
-    ]
-
-
 def test_the_last_columns_begin_a_line_where_the_terminal_is_too_narrow(printed: Printed) -> None:
     _, *lines = (line.rstrip() for line in printed(18))
     assert lines == ["  due", "press-4  a gripper", "         with a", "         long name", "  now", "b", "  in 5 d"]

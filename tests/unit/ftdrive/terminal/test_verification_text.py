@@ -1,14 +1,11 @@
 """A verification as it is printed."""
 
-import io
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
-from rich.console import Console
 from syrupy.assertion import SnapshotAssertion
 
 from ftcalib.after.verification import Verification
@@ -75,7 +72,6 @@ FAILED = replace(FOUND, passed=False)
         pytest.param(verified(replace(FAILED, update=cast("Any", "bias")), passed=False), False, id="update"),
         pytest.param(verified(FOUND, passed=False), False, id="noisy"),
         pytest.param(verified(drift="bad"), False, id="drift"),
-        pytest.param(verified(drift="ok"), False, id="small-drift"),
         pytest.param(verified(drift="ok"), True, id="small-drift-verbose"),
     ],
 )
@@ -84,10 +80,3 @@ def test_what_is_printed(
 ) -> None:
     monkeypatch.setattr(messages, "verbose", verbose)
     assert "\n".join(printed(one)) == snapshot
-
-
-def test_only_a_difference_beyond_three_sigma_is_marked(monkeypatch: pytest.MonkeyPatch, printed: Any) -> None:
-    coloured = Console(file=(file := io.StringIO()), force_terminal=True, color_system="standard", width=120)
-    monkeypatch.setattr("ftdrive.terminal.report.answer", coloured)
-    printed(verified())
-    assert re.findall(r"\x1b\[1;33m *([^ \x1b]*)", file.getvalue()) == ["0.500"]

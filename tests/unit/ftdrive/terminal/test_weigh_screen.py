@@ -88,22 +88,12 @@ def mass(text: str) -> list[str]:
     return [row.strip() for row in large_figures(text)]
 
 
-def test_figures_are_three_rows_high_and_letters_one() -> None:
-    assert [row.rstrip() for row in large_figures("-4.06 kg")] == [
-        "    █ █   █▀█ █▀▀",
-        "▀▀▀ ▀▀█   █ █ █▀█",
-        "      ▀ ▀ ▀▀▀ ▀▀▀  kg",
-    ]
-
-
 @pytest.mark.parametrize(
     ("shown", "moving"),
     [
         pytest.param(ScaleState(PART, None, 3), False, id="parts"),
-        pytest.param(ScaleState(PART, None, 1), False, id="part"),
         pytest.param(ScaleState(NOTHING, None), False, id="no-zero"),
         pytest.param(ScaleState(PART, "contact"), False, id="contact"),
-        pytest.param(ScaleState(None, "moving"), False, id="moving"),
         pytest.param(ScaleState(None, None, stale="[sensor] silent for 0.3 s"), False, id="stale"),
         pytest.param(ScaleState(PART, "count"), False, id="count"),
         pytest.param(ScaleState(replace(NOTHING, poses=0, in_motion=True), None), True, id="in-motion"),
@@ -136,12 +126,6 @@ def test_a_zero_hides_the_number_of_before(refuses: bool, note: str) -> None:
     assert str(weighing.refusal or weighing.note) == note
     scale.press("")
     assert (scale.mass, " ".join(scale.rows[9:]).strip()) == (mass("0.8123 kg"), note)
-
-
-def test_in_motion_neither_zero_nor_poses_are_taken() -> None:
-    weighing = FakeWeighing(ScaleState(replace(NOTHING, poses=0, in_motion=True), None), moving=True)
-    Scale(weighing, "z", "p")
-    assert (weighing.is_zeroing, weighing.joins) == (False, False)
 
 
 @pytest.mark.parametrize("error", [StreamBroken("the cable is cut"), OSError(28, "No space left on device")])
