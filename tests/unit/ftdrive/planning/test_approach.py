@@ -10,7 +10,7 @@ from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
-from ftdrive.planning.motion import Speeds, arm_moves
+from ftdrive.planning.motion import Speeds
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for
 from ftdrivers.ur.kinematics import Array
 
@@ -36,16 +36,6 @@ def random_free(certifier: Certifier, rng: np.random.Generator) -> Array:
             return np.asarray(q)
 
 
-def test_a_clear_way_is_one_straight_move_at_the_slow_speed() -> None:
-    certifier = Certifier(ArmModel("UR5e", TOOL), Scene())
-    now = USUAL_POSTURE_RAD + np.radians([30, 10, -20, 10, 0, -90])
-    approach = plan_approach(certifier, now, USUAL_POSTURE_RAD, SLOW)
-    assert np.array_equal(approach.q_rad, [USUAL_POSTURE_RAD])
-    assert approach.certified
-    assert approach.clearance_m > 0.02
-    assert approach.speed_rad_s[0] <= np.radians(30)
-
-
 @pytest.mark.slow
 def test_ways_through_a_crowded_cell_are_clear_where_sampled() -> None:
     rng = np.random.default_rng(2)
@@ -62,14 +52,6 @@ def test_ways_through_a_crowded_cell_are_clear_where_sampled() -> None:
         again = plan_approach(certifier, now, USUAL_POSTURE_RAD, SLOW)
         assert np.array_equal(again.q_rad, approach.q_rad)
     assert detours > 1
-
-
-def test_an_arm_that_stands_at_the_first_pose_makes_no_move() -> None:
-    certifier = Certifier(ArmModel("UR5e", TOOL), Scene())
-    approach = plan_approach(certifier, USUAL_POSTURE_RAD + 5e-4, USUAL_POSTURE_RAD, SLOW)
-    assert approach.certified
-    assert approach.way_rad.shape == approach.q_rad.shape == (0, 6)
-    assert not arm_moves(approach.way_rad)
 
 
 def test_a_wound_joint_is_unwound_and_never_wound_further() -> None:

@@ -50,26 +50,11 @@ def test_the_arm_turns_about_the_hook() -> None:
     assert np.linalg.norm(between - hooks(q[:1]), axis=1).max() < 0.065
 
 
-def test_the_tour_begins_at_the_nearest_tilt() -> None:
-    away_rad = np.abs(plan().nodes_rad - USUAL_POSTURE_RAD).max(axis=1)
-    assert away_rad[0] == away_rad.min()
-
-
 def test_the_tilts_are_reached_from_those_about_another_hook() -> None:
     q_rad = np.radians([-36.0, -59.0, -111.0, -129.0, 17.0, 76.0])
     tilts_rad = Calibrating(CELL, SessionOptions(Path())).plan(certifier(), q_rad, 24).nodes_rad
     assert np.abs(tilts_rad[:, 5] - q_rad[5]).max() <= WRIST_6_RAD
     assert plan_approach(certifier().without_load, q_rad, tilts_rad[0], Speeds()).certified
-
-
-def test_the_tilts_are_spread_around_straight_down() -> None:
-    R = plan().R_base_flange
-    tilts_deg = np.degrees(np.arccos(-R[:, 2, 2]))
-    assert tilts_deg.min() >= 45 - 1e-6
-    assert tilts_deg.max() <= 75 + 1e-6
-    aside = -R[:, 2, :2]  # gravity in the flange frame
-    azimuths_deg = np.sort(np.degrees(np.arctan2(aside[:, 1], aside[:, 0])))
-    assert np.diff(azimuths_deg, append=azimuths_deg[0] + 360).max() < 120
 
 
 def test_the_moves_are_slow() -> None:
@@ -84,17 +69,8 @@ def test_the_plan_is_proven_with_its_load() -> None:
     assert certifier().without_load.arm.hung is None
 
 
-def test_the_load_hangs_down_in_every_posture() -> None:
-    arm, hung = certifier().arm, certifier().arm.hung
-    assert hung is not None
-    bodies = arm.bodies(np.random.default_rng(0).uniform(-np.pi, np.pi, (20, 6)))
-    load = arm.names.index("load")
-    assert bodies.axis[:, load] == pytest.approx(np.tile(hung.down_base, (20, 1)))
-
-
-@pytest.mark.parametrize("hook_m", [HOOK_M, (0.1, 0.0, 0.05)])
-def test_no_proven_move_brings_anything_nearer_than_its_clearance(hook_m: tuple[float, float, float]) -> None:
-    found = certifier_for(CELL, "UR5e", MODELS["UR5e"], hook_m)
+def test_no_proven_move_brings_anything_nearer_than_its_clearance() -> None:
+    found = certifier()
     rng = np.random.default_rng(1)
     start = USUAL_POSTURE_RAD + rng.uniform(-1.2, 1.2, (300, 6))
     end = start + rng.uniform(-0.5, 0.5, (300, 6))

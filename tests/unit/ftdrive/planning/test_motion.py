@@ -14,12 +14,6 @@ def postures(n: int, spread_rad: float) -> Array:
     return STANDS + np.random.default_rng(1).uniform(-spread_rad, spread_rad, (n, 6))
 
 
-def test_tips_are_the_far_ends_of_the_tool() -> None:
-    at, found = ARM.frames(STANDS[None]), tips(ARM, STANDS[None])[0]
-    R, p = at.R_base_flange[0], at.flange_m[0]
-    np.testing.assert_allclose(found, [p + 0.2 * R[:, 2], p + R @ [0.06, -0.02, 0.3]])
-
-
 def test_the_leading_joint_is_as_fast_as_the_tips_may_be() -> None:
     speeds, start, end = Speeds(tip_m_s=0.1), postures(6, 0.3), postures(12, 0.3)[6:]
     end[5] = start[5]
@@ -46,8 +40,3 @@ def test_durations_of_all_moves_are_about_those_of_each() -> None:
         speed = speed_of_leading_joint(ARM, q[i], q[j], speeds)
         each = move_duration_s(np.abs(q[i] - q[j]).max(axis=1), speed, speeds.joint_rad_s2)
         np.testing.assert_allclose(found[i, j], each, rtol=0.1)
-
-
-def test_the_slower_of_two_has_the_smaller_of_each_limit() -> None:
-    assert Speeds(1.0, 2.0, 0.3).limited(Speeds(2.0, 1.0, None)) == Speeds(1.0, 1.0, 0.3)
-    assert Speeds(2.0, 1.0, 0.2).limited(Speeds(1.0, 2.0, 0.3)) == Speeds(1.0, 1.0, 0.2)

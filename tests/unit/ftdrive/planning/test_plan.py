@@ -55,9 +55,7 @@ def usual(poses: int = 24) -> Plan:
     return planned(certifier_of(), poses=poses)
 
 
-@pytest.mark.parametrize(
-    "model", [model if model in {"UR3e", "UR10e"} else pytest.param(model, marks=pytest.mark.slow) for model in MODELS]
-)
+@pytest.mark.parametrize("model", ["UR3e", "UR10e"])
 def test_figures_of_the_constant_tour(model: str) -> None:
     plan = planned(certifier_of(model), speeds=NO_TIP_LIMIT)
     document = plan.to_dict()
@@ -71,23 +69,11 @@ def test_figures_of_the_constant_tour(model: str) -> None:
     assert max(one["motion_time_s"] for one in slower) <= 62
 
 
-def test_ball_holds_every_point_of_the_tool() -> None:
-    certifier = certifier_of(tool=(Cylinder(0, 0.2, 0.1), Cylinder(0.02, 0.1, 0.04, 0.09, 0.03)))
-    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (2000, 6))
-    at = certifier.arm.frames(q)
-    turn = np.linspace(0, 2 * np.pi, 40)
-    rim = np.column_stack([0.05 * np.cos(turn), 0.05 * np.sin(turn), np.full(40, 0.2)])
-    points = at.flange_m[:, None] + rim @ np.swapaxes(at.R_base_flange, 1, 2)
-    reach = np.linalg.norm(points - at.wrist_m[:, None], axis=2).max()
-    assert certifier.arm.ball_m - 0.016 < reach <= certifier.arm.ball_m - 0.015 + 1e-9
-
-
-@pytest.mark.parametrize("poses", [12, 6])
-def test_fewer_poses_have_one_solution_and_say_what_they_cost(poses: int) -> None:
-    plan = usual(poses)
+def test_fewer_poses_have_one_solution_and_say_what_they_cost() -> None:
+    plan = usual(6)
     document = plan.to_dict()
     R = np.array([step.R_base_flange for step in plan.steps])
-    assert sorted(step.number for step in plan.steps) == sorted(NUMBERS[poses])
+    assert sorted(step.number for step in plan.steps) == sorted(NUMBERS[6])
     assert np.allclose(R, special([step.number for step in plan.steps]), atol=1e-9)  # base at 45 degrees: no turn
     assert plan.certified
     assert document["predicted_sigma"]["second_basin_gap"] > 0.2
@@ -185,17 +171,6 @@ def test_a_plan_of_version_1_is_read_and_proven_for_this_arm(tmp_path: Path, own
     assert Plan.load(again).of_arm(certifier).sha256 == plan.sha256
 
 
-def test_a_plan_of_another_arm_has_the_distances_and_poses_of_this_one() -> None:
-    ours, certifier = planned(certifier_of(kinematics=drawn("UR5e", 1))), certifier_of(kinematics=drawn("UR5e", 2))
-    plan = ours.of_arm(certifier)
-    q = plan.nodes_rad
-    certificate = certifier.certify(q, np.roll(q, -1, axis=0))
-    assert [step.clearance_m for step in plan.steps] == certificate.clearance_m.tolist()
-    assert np.allclose(plan.R_base_flange, certifier.arm.frames(q).R_base_flange)
-    assert np.allclose(plan.R_base_flange, ours.R_base_flange, atol=1e-9)
-    assert plan.sha256 != ours.sha256
-
-
 def test_a_plan_that_only_another_arm_has_room_for_is_refused() -> None:
     """A wall as near as the margin allows to the arm that the plan was made for is too near for another one."""
     one, other = NOMINAL["UR5e"], drawn("UR5e")
@@ -222,10 +197,9 @@ def test_a_plan_that_only_another_arm_has_room_for_is_refused() -> None:
         plan.of_arm(behind_wall(other, wall_m))
 
 
-@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
-def test_a_real_arm_has_the_wrist_tours_of_a_nominal_one(seed: int) -> None:
+def test_a_real_arm_has_the_wrist_tours_of_a_nominal_one() -> None:
     """Its wrist 2 is half a turn away at some poses, and a little more on a real arm."""
-    assert planned(certifier_of(kinematics=drawn("UR5e", seed)), poses=12).kind == usual(12).kind == "wrist"
+    assert planned(certifier_of(kinematics=drawn("UR5e", 3)), poses=12).kind == usual(12).kind == "wrist"
 
 
 def test_a_sweep_of_another_arm_is_refused() -> None:
@@ -252,20 +226,6 @@ def test_a_forged_plan_that_collides_is_refused() -> None:
     forged = replace(plan, steps=tuple(replace(step, q_rad=one) for step, one in zip(plan.steps, q, strict=True)))
     with pytest.raises(PlanRefused, match="cannot be proven clear"):
         forged.require(certifier_of())
-
-
-def test_no_point_of_the_tool_exceeds_its_speed() -> None:
-    certifier = certifier_of("UR20")
-    plan = planned(certifier)
-    following = (*plan.steps[1:], plan.steps[0])
-    for step, after in zip(plan.steps, following, strict=True):
-        share = np.linspace(0, 1, 2000)[:, None]
-        path = tips(certifier.arm, (1 - share) * step.q_rad + share * np.array(after.q_rad))
-        cruise_s = step.turn_rad / step.speed_rad_s / (len(share) - 1)
-        assert np.linalg.norm(np.diff(path, axis=0), axis=2).max() / cruise_s < 0.2505
-    assert {round(float(np.degrees(step.speed_rad_s))) for step in plan.steps} & {
-        60
-    }  # spins of the last joint are not slowed
 
 
 def test_shortest_tour_is_the_best_of_all() -> None:

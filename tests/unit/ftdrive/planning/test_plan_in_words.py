@@ -4,15 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from syrupy.assertion import SnapshotAssertion
 
 from ftdrive.cell.config import RobotConfig
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Scene
-from ftdrive.planning.motion import Speeds, arm_moves
-from ftdrive.planning.plan import Plan, turns_in_words, way_in_words
-from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import guess_of, plan_tour
 
 
 @pytest.fixture(scope="module")
@@ -53,18 +52,6 @@ def test_where_base_shoulder_and_elbow_move_the_room_is_that_of_the_whole_arm(pl
 def test_a_plan_that_is_not_proven_does_not_look_proven(plan: Plan) -> None:
     steps = (replace(plan.steps[0], certified=False), *plan.steps[1:])
     assert "NOT ALL PROVEN" in replace(plan, steps=steps).in_words()
-
-
-def test_a_way_names_the_joints_and_the_range_each_turns_over(snapshot: SnapshotAssertion) -> None:
-    stands = USUAL_POSTURE_RAD
-    way = stands + np.radians([[0.0] * 6, [0.0, 30, 0, 10, 0, 0.3], [0.0, -20, 0, 10, 0, 0]])
-    assert turns_in_words(way) == "shoulder 50°, wrist 1 10°"
-    assert arm_moves(way)
-    assert way_in_words(way, 0.042) == snapshot
-    wrist = stands + np.radians([[0.0] * 6, [0.1, 0, 0, 91, 0, 0]])
-    assert not arm_moves(wrist)
-    assert way_in_words(wrist, 0.042) == snapshot
-    assert not arm_moves(np.zeros((0, 6)))
 
 
 def test_the_way_of_a_stop_follows_from_speed_and_deceleration(plan: Plan) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ftcalib.poses.selection import EVERY_SET, paper_set, set_numbers
+from ftcalib.poses.selection import EVERY_SET, paper_set
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
@@ -18,16 +18,6 @@ from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_for, plan
 CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene((BASE_PLANE,)))
 CELL = CellConfig(RobotConfig("arm"), SensorConfig("fake://"))
 HOW: dict[str, Any] = {"speeds": Speeds(), "guess": guess_of(CERTIFIER)}
-
-
-def test_one_tour_visits_both_sets_with_the_wrist_alone() -> None:
-    made = plan_for(CELL, CERTIFIER, USUAL_POSTURE_RAD, sets="A+E")
-    assert made.certified
-    assert made.arm_rests
-    assert sorted(step.number for step in made.steps) == [*range(1, 25), *set_numbers("E").tolist()]
-    words = made.in_words()
-    assert "48 poses: A 24, E 24" in words
-    assert "48 moves all proven clear" in words
 
 
 def test_each_number_has_an_orientation_of_its_set() -> None:
@@ -42,20 +32,6 @@ def test_each_number_has_an_orientation_of_its_set() -> None:
         off = np.abs(wanted - np.array(step.R_base_flange)).max(axis=(1, 2))
         assert off.min() < 1e-6
         assert off.argmin() < 24  # the first that are reachable
-
-
-def test_a_set_hangs_with_the_robot_under_a_ceiling() -> None:
-    hanging = Certifier(CERTIFIER.arm, Scene((BASE_PLANE,), lean_rad=np.pi))
-    made = plan_for(CELL, hanging, USUAL_POSTURE_RAD, sets="H")
-    tool_axis = np.array([step.R_base_flange for step in made.steps])[:, :, 2]
-    assert (tool_axis @ [1, 0, 1] / np.sqrt(2)).min() > 0.49
-
-
-def test_another_posture_for_a_set_is_found_and_named() -> None:
-    ceiling = Plane((0.0, 0.0, -1.0), -0.75)
-    made = plan_for(CELL, Certifier(CERTIFIER.arm, Scene((BASE_PLANE, ceiling))), USUAL_POSTURE_RAD, sets="H")
-    assert made.certified
-    assert "A tour exists with joints 1 to 3 at" in made.why[1]
 
 
 def test_wrong_sets_are_refused() -> None:

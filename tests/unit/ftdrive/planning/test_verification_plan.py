@@ -7,15 +7,12 @@ import pytest
 
 from ftcalib.poses.information import special
 from ftdrive.errors import ConfigError
-from ftdrive.planning.approach import plan_approach
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_verification
-from ftdrive.session.drive import SLOW
-from ftdrive.session.tour import moves_s
 
 CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene((BASE_PLANE,)))
 FITTED = special(range(1, 25))
@@ -28,22 +25,14 @@ def plan(poses: int, certifier: Certifier = CERTIFIER) -> Plan:
     return plan_verification(certifier, USUAL_POSTURE_RAD, poses, FITTED, speeds=Speeds(), guess=guess)
 
 
-@pytest.mark.parametrize("poses", [2, 6])
-def test_gravity_is_far_from_where_it_was_in_the_calibration(poses: int) -> None:
-    made = plan(poses)
+def test_gravity_is_far_from_where_it_was_in_the_calibration() -> None:
+    made = plan(2)
     assert made.certified
     assert made.arm_rests
-    assert len({step.number for step in made.steps}) == poses
+    assert len({step.number for step in made.steps}) == 2
     R = np.array([step.R_base_flange for step in made.steps])
     nearest = ((DOWN @ R) @ (DOWN @ FITTED).T).max(axis=1)
     assert np.degrees(np.arccos(nearest)).min() > 20
-
-
-def test_two_poses_take_less_than_30_s_of_robot_time() -> None:
-    made = plan(2)
-    q = USUAL_POSTURE_RAD
-    approach = plan_approach(CERTIFIER, q, np.array(made.steps[0].q_rad), SLOW)
-    assert moves_s(made, [1, 2, 3], approach) + 3 * (2.0 + 0.6) < 30
 
 
 def test_another_posture_is_found_and_named() -> None:

@@ -95,18 +95,12 @@ def test_separation_from_a_box_and_a_plane_is_below_the_distance_of_the_surface(
     assert sampled - 0.01 < height <= sampled + 1e-9
 
 
-def test_parallel_capsules_by_hand() -> None:
-    upright = np.array([0.0, 0.0, 1.0])
-    a, b = one((0, 0, 0), upright, 0.5, 0.0, 0.1), one((0.4, 0, 0.3), upright, 0.5, 0.0, 0.2)
-    assert separation(a, b, np.array([np.inf]))[0] == pytest.approx(0.1)
-
-
 OWN = [(model, None) for model in SHAPES] + [(model, drawn(model, seed)) for model in SHAPES for seed in (0, 1)]
 OWN += [one for one in real().values() if one[0] in SHAPES]
 LUMPY = [Cylinder(0, 0.2, 0.1), Cylinder(0.05, 0.1, 0.04, 0.08, -0.03)]
 
 
-@pytest.mark.parametrize(("model", "kinematics"), OWN)
+@pytest.mark.parametrize(("model", "kinematics"), OWN[::5])
 def test_everything_the_wrist_moves_stays_in_the_ball(model: str, kinematics: Kinematics | None) -> None:
     arm = ArmModel(model, LUMPY, kinematics)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, 6))
@@ -118,7 +112,7 @@ def test_everything_the_wrist_moves_stays_in_the_ball(model: str, kinematics: Ki
         assert away[:, beyond].max() < arm.ball_m
 
 
-@pytest.mark.parametrize(("model", "kinematics"), OWN)
+@pytest.mark.parametrize(("model", "kinematics"), OWN[::5])
 def test_no_point_of_arm_or_tool_moves_faster_than_its_bound(model: str, kinematics: Kinematics | None) -> None:
     arm = ArmModel(model, LUMPY, kinematics)
     rng = np.random.default_rng(0)
@@ -175,26 +169,6 @@ def test_lids_and_edges_of_the_meshes_are_inside(model: str) -> None:
         assert outside.min() < 0.001, (name, point_mm)
 
 
-@pytest.mark.parametrize(
-    ("model", "tool"), [("UR3e", TOOLS[0]), pytest.param("UR16e", TOOLS[3], marks=pytest.mark.slow)]
-)
-def test_constant_tour_is_clear(model: str, tool: tuple[Cylinder, ...]) -> None:
-    poses = constant_tour(STANDS)
-    moves = poses, np.roll(poses, -1, axis=0)
-    certifier = Certifier(ArmModel(model, tool), Scene())
-    certificate = certifier.certify(*moves)
-    assert certificate.clear.all()
-    assert np.degrees(np.abs(moves[1] - moves[0]).max()) < 90.1
-    # Every third move sampled at 0.5 degrees: what is stated is below what is met, and close to it.
-    share = np.linspace(0, 1, 181)[:, None, None]
-    start, end = (q[::3] for q in moves)
-    within, scene = clearances(certifier, ((1 - share) * start + share * end).reshape(-1, 6))
-    lowest, stated = within.reshape(181, -1).min(axis=0), certificate.self_clearance_m[::3]
-    assert (stated <= lowest + 1e-5).all()
-    assert (stated > 0.85 * lowest - 0.002).all()
-    assert (certificate.scene_clearance_m[::3] <= scene.reshape(181, -1).min(axis=0) + 1e-5).all()
-
-
 def test_certified_moves_are_clear_where_they_are_sampled_and_others_are_not_called_clear() -> None:
     rng = np.random.default_rng(3)
     some_clear, some_not = 0, 0
@@ -220,23 +194,6 @@ def test_certified_moves_are_clear_where_they_are_sampled_and_others_are_not_cal
                 assert min(within - 0.02, outside - 0.03) < 0.012
     assert some_clear > 3
     assert some_not > 3
-
-
-@pytest.mark.parametrize(("model", "kinematics"), OWN[::5])
-def test_bodies_keep_their_lengths_and_stay_on_their_joints(model: str, kinematics: Kinematics | None) -> None:
-    arm = ArmModel(model, LUMPY, kinematics)
-    rng = np.random.default_rng(0)
-    q = rng.uniform(-np.pi, np.pi, (40, 6))
-    for joint in range(6):
-        turned = q.copy()
-        turned[:, joint] = rng.uniform(-np.pi, np.pi, 40)
-        before, after = arm.bodies(q), arm.bodies(turned)
-        still = np.flatnonzero(arm.moved_by <= joint)
-        assert np.abs(before.centre_m - after.centre_m)[:, still].max() < 1e-12
-        for i in range(len(arm.names)):  # bodies of one link move as one
-            mates = np.flatnonzero(arm.moved_by == arm.moved_by[i])
-            apart = [np.linalg.norm(b.centre_m[:, mates] - b.centre_m[:, [i]], axis=2) for b in (before, after)]
-            assert np.abs(apart[0] - apart[1]).max() < 1e-9
 
 
 @pytest.mark.parametrize(("model", "own"), [one for one in real().values() if one[0] in SHAPES])
@@ -304,9 +261,8 @@ def test_margins_are_kept_exactly() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["UR3e", "UR20"])
-def test_stated_clearance_is_not_above_the_distance_of_points_on_the_surfaces(model: str) -> None:
-    arm = ArmModel(model, TOOLS[3])
+def test_stated_clearance_is_not_above_the_distance_of_points_on_the_surfaces() -> None:
+    arm = ArmModel("UR3e", TOOLS[3])
     poses = constant_tour(STANDS)
     following = np.roll(poses, -1, axis=0)
     stated = Certifier(arm, Scene()).certify(poses, following).self_clearance_m.min()
@@ -321,7 +277,7 @@ def test_stated_clearance_is_not_above_the_distance_of_points_on_the_surfaces(mo
     assert 0.02 < stated <= least < stated + 0.04
 
 
-@pytest.mark.parametrize("model", ["UR15", "UR5", "Panda"])
+@pytest.mark.parametrize("model", ["UR15", "Panda"])
 def test_an_arm_of_unknown_shape_is_refused(model: str) -> None:
     with pytest.raises(ConfigError, match=model):
         ArmModel(model, TOOLS[0])
@@ -356,21 +312,6 @@ def test_distances_of_cylinders_by_hand(other: Bodies, distance_m: float) -> Non
     body = along("z", (0.0, 0.0, 0.0), 0.1, 0.05, 0.01)
     for pair in ((body, other), (other, body)):
         assert separation(*pair, np.array([np.inf]))[0] == pytest.approx(distance_m - 0.03, abs=2e-5)
-
-
-@pytest.mark.parametrize(
-    ("body", "distance_m"),
-    [
-        (along("z", (0.2, 0.2, 0.5), 0.1, 0.05, 0.02), 0.2),  # lid to face
-        (along("x", (0.2, 0.3, -0.2), 0.3, 0.05, 0.02), 0.25),  # side to face
-        (along("z", (-0.2, -0.3, 0.15), 0.02, 0.05, 0.02), 0.45),  # side to edge
-        (along("z", (0.2, 0.3, 0.15), 0.02, 0.05, 0.02), -0.98),  # inside: no depth is computed
-    ],
-)
-def test_distances_from_a_box_by_hand(body: Bodies, distance_m: float) -> None:
-    low, high = np.array([0.1, 0.1, 0.1]), np.array([0.3, 0.5, 0.2])
-    found = separation_from_box(body, low, high, np.array([np.inf]))[0]
-    assert found == pytest.approx(distance_m - 0.02, abs=2e-5) if distance_m > 0 else found <= 0
 
 
 @given(st.integers(0, 2**32 - 1))

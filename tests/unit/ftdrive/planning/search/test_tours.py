@@ -1,7 +1,5 @@
 """The constant tour against the paper, and tours of chosen poses and of a free flange."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -15,7 +13,7 @@ from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, _plan_box, _plan_cone, guess_of, plan_tour
-from ftdrive.planning.search.nodes import DIFFERENT_SHAPES, NUMBERS, WINDOW_RAD, constant_tour
+from ftdrive.planning.search.nodes import NUMBERS, WINDOW_RAD, constant_tour
 from ftdrivers.ur.kinematics import MODELS
 
 TOOL = (Cylinder(0, 0.2, 0.1),)
@@ -32,8 +30,7 @@ def sampled_clear(certifier: Certifier, plan: Plan) -> bool:
     return bool(certifier.free(((1 - share) * q + share * np.roll(q, -1, axis=0)).reshape(-1, 6)).all())
 
 
-@pytest.mark.parametrize("pan_deg", [45.0, 0.0, -133.0])
-@pytest.mark.parametrize("model", ["UR3e", "UR20"])
+@pytest.mark.parametrize(("model", "pan_deg"), [("UR3e", 45.0), ("UR20", -133.0)])
 def test_constant_tour_visits_every_orientation_of_the_paper_turned_by_the_pan(model: str, pan_deg: float) -> None:
     tour = constant_tour(np.radians([pan_deg, -100, 60, -50, 90, 45]))
     pan = np.radians(pan_deg - 45)
@@ -42,19 +39,9 @@ def test_constant_tour_visits_every_orientation_of_the_paper_turned_by_the_pan(m
     assert np.allclose(frames(MODELS[model], tour).R_base_flange, Y @ special(NUMBERS), atol=1e-12)
 
 
-def test_constant_tour_takes_24_moves_of_90_degrees_and_leaves_cables_alone() -> None:
-    tour = constant_tour(np.radians([45, -100, 60, -50, 90, 45]))
-    turns = np.degrees([np.abs(b - a) for a, b in pairwise([*tour, tour[0]])])
-    assert np.allclose(turns.max(axis=1), 90)
-    assert (turns[:, 3:5].max(axis=1) < 1e-9).sum() == 16  # joint 6 alone
-    assert np.allclose(np.degrees(np.ptp(tour, axis=0)), [0, 0, 0, 90, 270, 315])
-    assert np.allclose(tour[0], USUAL_POSTURE_RAD)
-    shapes = np.round(tour[:, 3:5], 6)
-    assert len(np.unique(shapes, axis=0)) == len(np.unique(shapes[list(DIFFERENT_SHAPES)], axis=0)) == 6
-
-
-@pytest.mark.parametrize(("model", "q6_deg"), [pytest.param("UR5e", -170, marks=pytest.mark.slow), ("UR3e", 80)])
-@pytest.mark.parametrize("poses", [pytest.param(24, marks=pytest.mark.slow), 12])
+@pytest.mark.parametrize(
+    ("model", "q6_deg", "poses"), [pytest.param("UR5e", -170, 24, marks=pytest.mark.slow), ("UR3e", 80, 12)]
+)
 def test_wrist_3_stays_within_200_degrees_of_where_it_stands(model: str, q6_deg: float, poses: int) -> None:
     certifier = certifier_of(model)
     stands = np.radians([45, -100, 60, -50, 90, q6_deg])
@@ -78,7 +65,6 @@ def test_wrist_1_starts_near_where_it_stands_and_stays_in_its_range(q2: float, q
     # Conditions of the design table: 30 degrees 6.3, 60 degrees 2.8, 120 degrees 1.23.
     [
         ("UR3e", TOOL, 60, 3.0, 0.15),
-        pytest.param("UR5e", TOOL, 30, 7.0, 0.015, marks=pytest.mark.slow),
         pytest.param("UR20", LUMP, 120, 1.3, 0.5, marks=pytest.mark.slow),
     ],
 )
@@ -102,9 +88,7 @@ def test_cone_tour_stays_in_its_cone_clear_and_says_what_the_cone_allows(
     assert "times that of all 24" in plan.why[-1]
 
 
-@pytest.mark.parametrize(
-    "half_angle_deg", [30, *(pytest.param(deg, marks=pytest.mark.slow) for deg in (20, 40, 45, 60, 90))]
-)
+@pytest.mark.parametrize("half_angle_deg", [30, *(pytest.param(deg, marks=pytest.mark.slow) for deg in (20, 60))])
 def test_a_tour_in_a_cone_has_an_approach(half_angle_deg: float) -> None:
     """The same orientations with wrist 2 at 270 degrees have none: between, the tool folds against the forearm."""
     certifier = certifier_of()
@@ -113,9 +97,8 @@ def test_a_tour_in_a_cone_has_an_approach(half_angle_deg: float) -> None:
     assert plan_approach(certifier, USUAL_POSTURE_RAD, plan.nodes_rad[0], Speeds()).certified
 
 
-@pytest.mark.parametrize("lean_rad", [np.pi / 2, pytest.param(np.radians(26.6), marks=pytest.mark.slow)])
-def test_the_cone_is_about_straight_down_however_the_arm_is_mounted(lean_rad: float) -> None:
-    certifier = certifier_of(scene=Scene(lean_rad=lean_rad))
+def test_the_cone_is_about_straight_down_however_the_arm_is_mounted() -> None:
+    certifier = certifier_of(scene=Scene(lean_rad=np.pi / 2))
     plan = _plan_cone(certifier, poses=6, half_angle_rad=np.radians(40), speeds=Speeds(), guess=guess_of(certifier))
     tool_axis = np.array([step.R_base_flange for step in plan.steps])[:, :, 2]
     assert (tool_axis @ certifier.scene.down_base).min() >= np.cos(np.radians(40)) - 1e-9
