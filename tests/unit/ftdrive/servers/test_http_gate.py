@@ -99,17 +99,9 @@ def test_the_host_is_the_bound_address(host: str, bound: str, served: bool) -> N
     assert (not refusal_reason({"Host": host}, bound)) is served
 
 
-@pytest.mark.parametrize(
-    "host", ["127.0.0.1:10019.evil", "127.0.0.1:x", "evil@127.0.0.1", "127.0.0.1/evil", "[::1]evil"]
-)
+@pytest.mark.parametrize("host", ["127.0.0.1:10019.evil", "evil@127.0.0.1", "[::1]evil"])
 def test_what_only_begins_as_the_address_is_refused(host: str) -> None:
     assert "the server has a different address from" in refusal_reason({"Host": host}, "127.0.0.1")
-
-
-def test_only_the_stream_has_an_option_for_other_pages() -> None:
-    headers = {"Host": "127.0.0.1:1", "Origin": PAGE}
-    assert "`ftdrive stream --allow-origin https://evil.example`" in refusal_reason(headers, "127.0.0.1", [])
-    assert refusal_reason(headers, "127.0.0.1").endswith("not served; open the page of this server")
 
 
 def handshake(port: int, origin: str | None, host: str = "127.0.0.1", **options: Any) -> Any:

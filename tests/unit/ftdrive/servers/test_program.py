@@ -107,15 +107,6 @@ def test_a_cycle_weighs_the_part_and_takes_it_out_of_the_wrench() -> None:
     assert [event.kind for event in cell.stream.take_events()].count("load") == 2
 
 
-def test_a_push_is_a_contact_and_its_weight_is_refused() -> None:
-    cell = Cell(*[(POSE, NOTHING)] * 3, (POSE, np.array([5.0, 8.0, 0, 0, 0, 0])))
-    cell.run(0.2)
-    cell.ask(6, ZERO)
-    cell.run(2.2)
-    pushed = cell.ask(7, WEIGH, 0.8)
-    assert (pushed["condition"], pushed["state"], pushed["code"], pushed["mass"]) == (1, 3, 4, 0)
-
-
 def test_a_zero_with_a_part_is_refused() -> None:
     cell = Cell((POSE, part(POSE, 2.0)))
     cell.run(0.1)
@@ -136,15 +127,6 @@ def test_the_tracked_bias_ages_while_a_contact_hides_it() -> None:
     hidden = cell.run(1.3)
     assert hidden["bias_age"] > 1
     assert hidden["bias_fy"] == pytest.approx(-0.3, abs=0.1)
-
-
-def test_a_lost_controller_is_reported_once() -> None:
-    cell = Cell((POSE, NOTHING))
-    cell.run(0.1)
-    cell.registers.broken = True
-    cell.run(0.1)
-    assert len(cell.said) == 1
-    assert "cable is cut" in cell.said[0]
 
 
 class Unsteady:

@@ -104,18 +104,6 @@ def node(monkeypatch: pytest.MonkeyPatch) -> FakeNode:
 FIXED = Fixed(base_frame="ur_base", flange_frame="ur_tool0", sensor_frame="wrist_ft")
 
 
-def test_the_names_of_frames_are_those_of_the_parameters(node: FakeNode) -> None:
-    found = TransformPublisher(node, FIXED)
-    names = {
-        WrenchFrame("sensor", "sensor"): "wrist_ft",
-        WrenchFrame("base", "tcp"): "ur_base_at_tcp",
-        WrenchFrame("base", "sensor"): "ur_base_at_wrist_ft",
-        WrenchFrame("tcp", "tcp"): "tcp",
-        WrenchFrame("flange", (0.0, 0.0, 0.15)): "ur_tool0_at_0_0_0.15_m",
-    }
-    assert {frame: found.named(frame.id) for frame in names} == names
-
-
 def test_sensor_and_tcp_are_published_once_where_the_height_is_known(node: FakeNode) -> None:
     TransformPublisher(node, FIXED).use(INFO)
     ((topic, (t_ns, found)),) = node.published

@@ -18,13 +18,10 @@ from ftdrivers.clock import REAL
 
 HUGE = "1" + "0" * 308
 NASTY = (
-    *("nan", "inf", "1e308", HUGE, f"-{HUGE}", "1000000000", "0", "-0", "none", "unknown", "choose", "²"),
-    *("0:1000000000:90", f"0:{HUGE}:90", f"0:60:90:{HUGE}:0", f"0:60:{HUGE}", f"0:60:90:0.{'0' * 320}1:0"),
-    *(f"{HUGE}:0:0:0", f"1:0:0:-{HUGE}", "0:0:0:0", "+x 1000000000", f"-{HUGE}:{HUGE}:{HUGE}:0:0:1"),
-    *("400:400:0:1000000000:1000000000:300", "0:0:0:0:0:0", "9" * 10_000, "x" * 10_000),
-    *("0x10", "1,000", "<script>alert(1)</script>", "'\"`\\"),
+    *("nan", "1e308", f"-{HUGE}", "-0", "none", "²", f"0:60:90:{HUGE}:0", f"0:60:90:0.{'0' * 320}1:0"),
+    *(f"1:0:0:-{HUGE}", "0:0:0:0", f"-{HUGE}:{HUGE}:{HUGE}:0:0:1", "x" * 10_000, "<script>alert(1)</script>"),
 )
-IMPOSSIBLE_NAMES = ("a..b", "x" * 10_000, "é" * 80, "http://[", "/dev/" + "x" * 5_000, "socketcan://" + "x" * 300)
+IMPOSSIBLE_NAMES = ("a..b", "é" * 80, "/dev/" + "x" * 5_000)
 ANSWERS = {ROBOT: "127.99.9.9", f"{MODEL} choice": "UR5e", SENSOR: "ati-serial:///dev/no-such-port"}
 ANSWERS |= {"sensor.height_mm": "33", f"{TOOL} 1": "0 60 80"}
 
@@ -99,24 +96,6 @@ def test_what_is_wrong_is_red_below_its_field(form: Form) -> None:
     form.enter("sensor.height_mm", "33")
     form.wait(lambda: "off the flange axis" in str(form.parts()["form/words"]))
     assert form.controls()["write"]["disabled"]
-
-
-def test_rows_keep_their_names(form: Form) -> None:
-    for _ in range(3):
-        form.enter(f"{WALLS} add")
-    form.wait(lambda: f"{WALLS} 3" in form.controls())
-    form.enter(f"{WALLS} 3", "700")
-    form.enter(f"{WALLS} 2 remove")
-    form.wait(lambda: f"{WALLS} 2" not in form.controls())
-    with pytest.raises(ValueError, match="does not have this control"):
-        form.enter(f"{WALLS} 2 remove")
-    form.enter(f"{WALLS} add")
-    form.wait(lambda: f"{WALLS} 4" in form.controls())
-    assert form.controls()[f"{WALLS} 3"]["value"] == "700"
-    for number in (1, 4):
-        form.enter(f"{WALLS} {number} remove")
-    form.wait(lambda: f"{WALLS} 4" not in form.controls())
-    assert form.described.texts[WALLS] == ["+x 700"]
 
 
 @pytest.mark.parametrize("name", IMPOSSIBLE_NAMES)

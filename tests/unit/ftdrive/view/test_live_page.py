@@ -1,7 +1,6 @@
 """The page of the live wrench and of the scale: what it says of a state, and what a viewer may do."""
 
 import json
-import re
 import time
 import weakref
 from dataclasses import replace
@@ -21,21 +20,17 @@ from ftdrive.planning.planner import certifier_for
 from ftdrive.recording import Recorder
 from ftdrive.stream.samples import WrenchFrame
 from ftdrive.stream.weighing import ScaleState
-from ftdrive.view.live_page import LivePage, WeighPage, texts
+from ftdrive.view.live_page import LivePage, WeighPage
 from ftdrive.view.page import Page, drawing
-from ftdrive.words.stream import NOISE_UNKNOWN, StreamSummary, state
+from ftdrive.words.stream import StreamSummary
 from tests.unit.ftdrive.stream.simulated import calibrated, dwells, info, paired, replayed
-from tests.unit.ftdrive.terminal.fake_stream import INFO, R_BASE_FLANGE, R_FLANGE_SENSOR, SIGMA, FakeStream, SteppedFeed
+from tests.unit.ftdrive.terminal.fake_stream import INFO, R_BASE_FLANGE, R_FLANGE_SENSOR, FakeStream, SteppedFeed
 from tests.unit.ftdrive.terminal.test_weigh_screen import NOTHING, PART, FakeWeighing
-from tests.unit.ftdrive.words.test_stream import Rig, reading_of
 
 PUSHED = -5.1 * np.array([0.1, -0.05, -1.0, -0.01, 0.04, 0.0])
 FRAMES = [
     WrenchFrame(),
-    WrenchFrame("flange", "flange"),
     WrenchFrame("base", "tcp"),
-    WrenchFrame("tcp", "tcp"),
-    WrenchFrame("base", "sensor"),
     WrenchFrame("sensor", (0.01, -0.02, 0.3)),
 ]
 CELL = CellConfig(RobotConfig(host="10.0.0.2"), SensorConfig(url="x"), ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)))
@@ -94,22 +89,6 @@ def test_arrow_and_line_of_action_do_not_depend_on_the_frame(frame: WrenchFrame)
         np.testing.assert_allclose(np.cross(point - sensor_m, force), across, atol=0.02)
 
 
-def test_the_flange_is_turned_as_the_arm_says() -> None:
-    w, x, y, z = Shown(FakeStream()).run(3)["scene/flange"]["turn"]
-    axis = np.array([x, y, z])
-    rotated = [v + 2 * np.cross(axis, np.cross(axis, v) + w * v) for v in np.eye(3)]
-    np.testing.assert_allclose(np.transpose(rotated), R_BASE_FLANGE, atol=1e-4)
-
-
-def test_less_than_four_sigmas_has_no_arrow() -> None:
-    reading = reading_of(Rig(FakeStream("contact")).run(3))
-    reading = replace(reading, wrench=np.array([0.0, 8.1, 0.0, 0.0, 0.0, 0.13]), sigma=np.repeat([2.0, 0.03], 3))
-    assert [reading.is_significant(first) for first in (0, 3)] == [True, True]
-    weaker = replace(reading, wrench=np.array([0.0, 7.9, 0.0, 0.0, 0.0, 0.11]))
-    assert [weaker.is_significant(first) for first in (0, 3)] == [False, False]
-    assert not replace(reading, sigma=np.full(6, np.nan)).is_significant(0)  # the noise is not known yet
-
-
 class Fresh(FakeStream):
     """The noise is not known yet."""
 
@@ -149,40 +128,6 @@ def test_what_the_page_shows(name: str, snapshot: SnapshotAssertion) -> None:
     assert in_lines(Shown(stream).run(blocks)) == snapshot
 
 
-def test_numbers_end_where_their_sigmas_do() -> None:
-    view = Rig(FakeStream("contact")).run(3)
-    wrench, sigma = np.array([0.0, 98.04, 0.0, 0.0, 0.0, 1.234]), np.repeat([2.1, 0.03], 3)
-    parts = texts(view, replace(reading_of(view), wrench=wrench, sigma=sigma))
-    _, force, torque = numbers_of(cast("Any", parts))
-    assert (force["value"], force["sigma"], force["note"]) == ("98.0", "± 2.1 (1 sigma)", "towards +y of base axes")
-    assert (torque["value"], torque["sigma"]) == ("1.234", "± 0.030 (1 sigma)")
-    assert torque["note"] == "turns about +z of base axes"
-
-
-def test_a_limit_of_the_first_estimates_shows_no_free_tool() -> None:
-    view = Rig(FakeStream()).run(3)
-    assert state(replace(view, status=replace(view.status, contact_limit=8e10))) == (NOISE_UNKNOWN, "")
-
-
-def test_contact_is_marked_in_the_plots() -> None:
-    shown = Shown(FakeStream("contact", block_s=0.05))
-    summary = StreamSummary(shown.feed)
-    plots = shown.run(240)["plots"]
-    assert [plot["unit"] for plot in plots["plots"]] == ["N"] * 3 + ["N·m"] * 3
-    assert re.fullmatch(r"Fz -4\.\d\d", plots["plots"][2]["label"])
-    assert [plot["sigma"] for plot in plots["plots"]] == pytest.approx(SIGMA)
-    assert plots["full"] == {"N": 10.0, "N·m": 0.5}  # the push of 8 N at 5.5 s is in the last 10 s
-    for plot in plots["plots"]:
-        known = [(low, high) for low, high in zip(plot["low"], plot["high"], strict=True) if low is not None]
-        assert known
-        assert all(-plots["full"][plot["unit"]] <= low <= high <= plots["full"][plot["unit"]] for low, high in known)
-    contact = plots["contact"]
-    assert contact[-1] == 1
-    lasts_s = contact[::-1].index(0) * plots["step_s"]
-    assert lasts_s == pytest.approx(summary.view().contact_s, abs=0.1)
-    assert len(contact) * plots["step_s"] == pytest.approx(plots["span_s"])
-
-
 def test_no_old_value_of_a_silent_device() -> None:
     certifier = certifier_for(CELL, "ur5e")
     stream = FakeStream("contact", silent_after=240, block_s=0.05)
@@ -215,32 +160,6 @@ def test_the_legend_names_each_colour_of_the_scene() -> None:
     assert {"force", "torque", "arm", "tool", "x", "y", "z"} <= named
     assert parts["scene/base"]["named"]
     assert any(part.get("alpha", 1) < 1 for part in parts.values() if part.get("colour") == "tool")
-
-
-def test_an_arm_at_rest_is_not_sent_again() -> None:
-    class Trembling(FakeStream):
-        def read(self) -> Any:
-            block = super().read()
-            return replace(block, q_rad=block.q_rad + 5e-5 * (-1) ** self.blocks)
-
-    shown = Shown(Trembling(), certifier=certifier_for(CELL, "ur5e"))
-    shown.run(3)
-    version = shown.page.since(0)[0]
-    shown.run(1)
-    newer = json.loads(shown.page.since(version)[1])
-    assert newer
-    assert not any(name.startswith("scene/arm") for name in newer)
-
-
-def test_events_are_listed_newest_first() -> None:
-    shown = Shown(FakeStream(block_s=0.05))
-    assert "events" not in shown.run(3)
-    shown.run(123)
-    shown.feed.note("<script>alert(1)</script>")
-    lines = "\n".join(shown.run()["events"]["lines"])
-    places = [lines.index(text) for text in ("<script>", "contact 8.0 N", "peg in")]
-    assert places == sorted(places)
-    assert re.search(r"\d\d:\d\d:\d\d contact 8\.0 N", lines)
 
 
 def test_without_a_viewer_nothing_is_shown_and_nothing_piles_up() -> None:

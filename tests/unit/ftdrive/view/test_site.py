@@ -77,16 +77,6 @@ def test_parts_arrive_once_and_the_newest_counts(page: Page) -> None:
     wait_until(lambda: page.viewers == 0)
 
 
-def test_the_last_state_arrives_before_the_end() -> None:
-    with serve_page("a page") as page:
-        events = Viewer(page).follow()
-        assert next(events)[1] == {"viewer": {"kind": "viewer", "number": 0}}
-        page.put({"result": lines("GOOD")})
-    received = list(events)
-    assert any("result" in data for _, data in received[:-1] if isinstance(data, dict))
-    assert received[-1][0] == "end"
-
-
 def test_stop_is_called_in_the_name_of_the_viewer_whatever_the_drawing_does(page: Page) -> None:
     stopped: list[str] = []
     page.add_stop(stopped.append)
@@ -140,18 +130,6 @@ def test_controls_are_not_used_from_another_site(page: Page) -> None:
     viewer = Viewer(page)
     for headers in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "same-site"}, {"Host": "evil.example"}):
         assert viewer.do("stop", **headers) == 403
-
-
-def test_a_value_that_a_handler_rejects_is_explained(page: Page) -> None:
-    def reject(_: str, value: object) -> None:
-        raise ValueError(f"{value} is no name")
-
-    page.put({"controls": controls(text_field("name", "Name", ""))})
-    page.on("name", reject)
-    viewer = Viewer(page)
-    headers = {"Origin": viewer.origin, "Content-Type": JSON}
-    answer = viewer.ask("POST", "/do", json.dumps({"name": "name", "value": "x"}), **headers)
-    assert (answer.status, answer.body) == (400, b"x is no name\n")  # type: ignore[attr-defined]
 
 
 def test_a_page_that_is_not_drawn_any_more_is_stale(page: Page) -> None:
