@@ -313,7 +313,6 @@ def test_what_the_panels_show(command: str, events: list[Event], page: Page, sna
     assert "alert" not in watched.shown()
 
 
-@pytest.mark.slow
 def test_a_sweep_is_one_motion(lab: Lab, page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sweep_planner, "RANDOM", 2)
     monkeypatch.setattr(sweep_planner, "CHANGED", 0)
