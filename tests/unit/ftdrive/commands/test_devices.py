@@ -47,19 +47,6 @@ def ask(place: str, _: object) -> list[Any]:
     raise DeviceTimeout("it is open elsewhere", "close the other program")
 
 
-def test_ports_and_interfaces_are_listed_with_what_is_wrong(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["devices"]) == 0
-    assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == [
-        " serial  /by-id/dev/ttyUSB0   FT232R   0403:6001",
-        "         ! you may not open it",
-        "           fix: join dialout",
-        "         ! its timer is slow",
-        "           fix: -",
-        " serial  /dev/ttyUSB1",
-        " can     can0   up   250000",
-    ]
-
-
 def test_places_are_probed_and_an_error_is_an_answer(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -77,10 +64,3 @@ def test_places_are_probed_and_an_error_is_an_answer(
     assert (usb["usb"], usb["serial_number"], usb["description"]) == ("0403:6001", "A9", "FT232R")
     assert [one["found"] for one in usb["findings"]] == ["you may not open it", "its timer is slow"]
     assert (bare["by_id"], bare["description"], bare["usb"], bare["findings"]) == (None, None, None, [])
-
-
-def test_a_computer_without_ports_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(list_ports, "comports", list)
-    monkeypatch.setattr(devices, "can_interfaces", list)
-    assert cli.run(["devices"]) == 0
-    assert capsys.readouterr().out == " no serial ports\n no CAN interfaces of the kernel\n"

@@ -11,7 +11,7 @@ import pytest
 
 from ftdrive import cli
 from ftdrive.checks import sensor as of_sensor
-from ftdrive.checks.arm import check_clock, check_flange
+from ftdrive.checks.arm import check_clock
 from ftdrive.checks.check import Check
 from ftdrive.checks.sensor import PUSH_S, examine_push
 from ftdrive.commands import doctor
@@ -63,15 +63,6 @@ def test_the_clock_of_the_arm_is_compared_over_a_second(pace: float, until: int,
         assert 1.0 <= clock.now_s() - begin_s < 1.1
 
 
-def test_the_pose_is_read_in_millimetres() -> None:
-    arm, silent = (cast("Any", Arm(FakeClock(), until=until)) for until in (10**6, 0))
-    read, unknown = (cast("Any", SimpleNamespace(tcp_offset=one)) for one in (np.zeros(6), None))
-    assert check_flange(arm, read).found == "TCP offset reported; flange at (100, -200, 346) mm in base"
-    failed = check_flange(silent, read)
-    assert (failed.state, failed.fix) == ("failed", "look at the cable")
-    assert check_flange(arm, unknown).state == "skipped"
-
-
 class Sensor:
     """Reads a bias; then windows of 10, 25 and -30 N along y, and the bias again."""
 
@@ -120,12 +111,6 @@ def test_an_emulated_push_is_along_x_of_the_base_and_ends(monkeypatch: pytest.Mo
     assert not ended.any()
 
 
-def test_without_a_reading_or_a_push_there_is_no_sign(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert examined(None, monkeypatch)[0].state == "skipped"
-    assert examined(Sensor(), monkeypatch, pushes=False)[0].found == "no push: the standard input is closed"
-    assert examined(Sensor(silent=True), monkeypatch)[0].state == "failed"
-
-
 Printed = Callable[..., list[str]]
 
 
@@ -147,19 +132,6 @@ def printed(lab: Lab, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: p
         return [line.strip() for line in capsys.readouterr().out.splitlines()]
 
     return run
-
-
-def test_each_subject_is_named_once_and_a_fix_follows_what_is_wrong(printed: Printed) -> None:
-    checks = (
-        Check("robot.remote", "ok", "remote control on", "none"),
-        Check("robot.speed", "warning", "slider at 30 %", "raise it"),
-        Check("sensor.noise", "failed", "saturated", "take the load off"),
-    )
-    lines = printed(*checks, options=["--all"])
-    assert [line.split()[0] for line in lines] == ["robot", "!", "fix:", "sensor", "fix:", "Not"]
-    assert lines[2].split("fix: ")[1] == "raise it"
-    assert printed(*checks[:2], options=["--all"])[-1] == "Usable; see the lines with !."
-    assert printed(checks[0], options=["--all"])[-1] == "All checks passed."
 
 
 def test_a_summary_has_each_subject_and_all_that_needs_attention(printed: Printed) -> None:

@@ -73,12 +73,6 @@ def test_from_an_empty_store_to_a_status(run: Callable[..., Ran], cells: Path, r
     assert err == ""
 
 
-def test_an_arm_that_belongs_to_no_cell_is_mentioned(run: Callable[..., Ran], cells: Path, runs: Path) -> None:
-    run("add", cells)
-    new_run(runs, "stray", result(DAY, serials=("arm-9", "ft-9")))
-    assert "no cell has the arm arm-9: add it to cells.toml" in run("index", runs)[1]
-
-
 def test_the_page_is_one_file_with_escaped_names(
     run: Callable[..., Ran], cells: Path, runs: Path, tmp_path: Path
 ) -> None:
@@ -120,10 +114,3 @@ def test_a_cell_that_is_like_a_stored_one_is_refused(run: Callable[..., Ran], ce
     code, _, err = run("add", other)
     assert (code, "the cells twin and press have the same [robot] host 10.0.0.1" in err) == (2, True)
     assert len(json.loads(run("status", "--json")[1])["cells"]) == 2
-
-
-def test_a_folder_of_folders_of_runs_has_a_hint(run: Callable[..., Ran], tmp_path: Path) -> None:
-    result(0).save(new_run(tmp_path / "cells" / "runs", "one") / "calibration.json")
-    code, out, err = run("index", tmp_path / "cells")
-    assert (code, out.partition(" added")[0]) == (0, " 0 results and 0 verifications")
-    assert "give a run folder, or the folder that contains run folders" in " ".join(err.split())

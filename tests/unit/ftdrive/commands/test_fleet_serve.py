@@ -31,19 +31,6 @@ def run(run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatc
     return call
 
 
-def answer_with(monkeypatch: pytest.MonkeyPatch, *answers: Fleet | BaseException) -> None:
-    """Have the store answer so; Ctrl-C follows."""
-    left = [*answers, KeyboardInterrupt()]
-
-    def fleet_state(_store: Store, _now: datetime) -> Fleet:
-        answer = left.pop(0)
-        if isinstance(answer, BaseException):
-            raise answer
-        return answer
-
-    monkeypatch.setattr(STATUS, "fleet_state", fleet_state)
-
-
 def test_the_page_has_the_cells_as_long_as_it_serves(run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch) -> None:
     pages = list[str]()
 
@@ -70,11 +57,6 @@ def test_the_page_has_the_cells_as_long_as_it_serves(run: Callable[..., Ran], mo
     assert 'ftdrive_bias_drift_found{cell="press-4",tool="gripper"} 0.0' in pages[0]
     with pytest.raises(OSError, match="refused"):
         urllib.request.urlopen(f"http://127.0.0.1:{ports[0]}/metrics", timeout=30)
-
-
-def test_another_address_is_said_to_be_unprotected(run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch) -> None:
-    answer_with(monkeypatch)
-    assert "Unprotected: any computer that reaches port" in run("--metrics", "0.0.0.0:0")[1]
 
 
 @pytest.mark.parametrize("address", ["10018", "localhost:x", "localhost:65536"])

@@ -73,19 +73,6 @@ def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(
     assert found["other_verdict"] == [{"run": str(worse), "before": "usable", "now": "good", "finding": None}]
 
 
-def test_runs_without_a_dataset_and_an_empty_store_are_mentioned(run: Callable[..., Ran], tmp_path: Path) -> None:
-    (calibrated_run(tmp_path / "runs", "interrupted") / "dataset.json").unlink()
-    stopped = calibrated_run(tmp_path / "runs", "stopped", header={"mode": "sweep"})
-    (stopped / "dataset.json").unlink()
-    code, out, err = run("runs")
-    assert code == 0
-    assert out.startswith("0 runs")
-    words = " ".join(err.split())
-    assert "they have no data to solve: 1; finish each with `ftdrive calibrate --resume RUN`" in words
-    assert "they have no data to solve: 1; start again with `ftdrive calibrate --sweep`" in words
-    assert "No runs: " in run()[2]
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [

@@ -159,26 +159,12 @@ def test_a_failed_verification_ends_with_7_and_the_others_go_on(lab: Lab) -> Non
     assert "error: the verification failed in A:" in err
 
 
-def test_a_cell_that_cannot_be_verified_gives_its_exit_code_at_the_end(lab: Lab) -> None:
-    lab.outcomes = [ConnectError("10.0.0.65 does not answer", "check it"), Declined("not confirmed, nothing moves")]
-    code, out, err = lab.run(answers=["yes"] * 3)
-    assert (code, lab.verified, err) == (3, ["A", "B", "C"], "")
-    assert out[0] == "A: not verified, 10.0.0.65 does not answer; check it"
-    assert out[1:] == ["B: ended, not confirmed, nothing moves", "C: passed"]
-
-
 def test_ctrl_c_in_a_session_ends_the_round(lab: Lab) -> None:
     lab.outcomes = ["", KeyboardInterrupt()]
     code, out, _ = lab.run(answers=["yes", "yes"])
     assert (code, lab.asked) == (130, ["A", "B"])
     assert out[0] == "A: passed"
     assert out[1].startswith("B: interrupted")
-
-
-def test_a_defect_is_not_hidden(lab: Lab) -> None:
-    lab.outcomes = [RuntimeError("a defect")]
-    with pytest.raises(RuntimeError, match="a defect"):
-        lab.run(answers=["yes"])
 
 
 def test_a_robot_that_the_store_does_not_know_is_refused_before_the_question(lab: Lab) -> None:
@@ -205,15 +191,3 @@ def test_a_variable_that_would_describe_every_cell_is_refused(
 def test_a_wrong_choice_is_refused(arguments: tuple[str, ...], words: str, lab: Lab) -> None:
     code, out, err = lab.run(*arguments)
     assert (code, out, words in err) == (2, [], True)
-
-
-def test_a_store_without_cells_says_how_to_add_them(lab: Lab) -> None:
-    lab.store.remove_cells(list(NAMES))
-    code, _, err = lab.run()
-    assert (code, "`ftdrive fleet add cells.toml`" in err) == (2, True)
-
-
-def test_nothing_due_is_success(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ftdrive.fleet.state.Fleet.is_due", lambda *_: False)
-    code, out, err = lab.run("--due")
-    assert (code, out, err) == (0, [], "No cell is due.")

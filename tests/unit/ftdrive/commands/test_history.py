@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult
-from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, user_folder
 from ftdrive.commands.options import CellOptions, SourceOptions
 from ftdrive.runs.run import Run
@@ -152,30 +151,6 @@ def test_two_calibrations_are_compared_by_file_run_and_id(run: Callable[..., Ran
     assert run("diff", first.id, first.id)[1].splitlines()[-1] == "The calibrations are the same."
 
 
-def test_one_tool_on_a_sensor_with_and_without_loads_reads_contacts_differently(
-    run: Callable[..., Ran], runs: Path
-) -> None:
-    alone = runs / "gripper-0" / "calibration.json"
-    for name, made in (("loads", "2026-11-20T08:00:00+00:00"), ("later", "2026-11-20T09:30:00+00:00")):
-        sensor = replace(SensorMatrix.usual(), source="loads", provenance={"created_utc": made})
-        replace(CalibrationResult.load(alone), sensor=sensor).save(runs / f"{name}.json")
-    for first, words in (("gripper-0", "from the data sheet in A"), ("loads.json", "2026-11-20 08:00 in A")):
-        out = run("diff", runs / first, runs / "later.json")[1].splitlines()
-        for line in (out[2], out[-1]):
-            assert words in line
-            assert "sensor.json of 2026-11-20 09:30 in B" in line
-    assert json.loads(run("diff", alone, runs / "later.json", "--json")[1])["sensors"][1].endswith("09:30")
-    assert not [line for line in run("diff", alone, alone)[1].splitlines() if "contact" in line]
-
-
-def test_a_result_whose_run_is_gone_is_compared_from_the_store(run: Callable[..., Ran], runs: Path) -> None:
-    Store().index(runs)
-    first, second = Store().results("gripper")[:2]
-    before = run("diff", first.id, second.id)
-    (runs / "gripper-0" / "calibration.json").unlink()
-    assert run("diff", first.id, second.id) == before
-
-
 @pytest.mark.parametrize(
     ("text", "code", "words"),
     [
@@ -222,18 +197,6 @@ def test_a_calibration_never_fails_for_the_store_and_is_caught_up(
     assert not default_file().exists()
 
 
-def test_a_result_that_solve_saves_in_its_run_is_indexed(
-    run: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = new_run(tmp_path / "runs", "a", result())
-    monkeypatch.setattr("ftdrive.commands.solve._solve_each", lambda *_: result(1).save(folder / "calibration-2.json"))
-    assert run("solve", folder)[0] == 0
-    assert not default_file().exists()
-    (folder / "calibration-2.json").unlink()
-    assert run("solve", folder, "-o", folder / "calibration-2.json")[0] == 0
-    assert len(Store().results()) == 2
-
-
 @pytest.mark.parametrize("command", [["record", "-o", "a.csv"], ["weigh"]])
 @pytest.mark.parametrize(
     ("more", "words"),
@@ -248,29 +211,6 @@ def test_options_that_name_another_cell_or_calibration_are_refused(
 ) -> None:
     code, _, err = run(*command, *more)
     assert (code, words in err) == (2, True)
-
-
-def test_a_tool_reaches_the_stream(run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch) -> None:
-    opened: list[tuple[Any, Any]] = []
-
-    def stream(_cell: object, wanted: object, **options: Any) -> object:
-        opened.append((wanted, options["force"]))
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("ftdrive.library.CellSource", stream)
-    for more in ([], ["--force"]):
-        run("live", "--tool", "gripper", "--robot", "10.0.0.2", "--sensor", "ati-can://can0", *more)
-    assert opened == [("gripper", False), ("gripper", True)]
-    assert "--tool cannot be combined with --replay" in run("live", "--tool", "gripper", "--replay", ".")[2]
-
-
-def test_the_temperature_is_a_column_if_a_sensor_reports_it(run: Callable[..., Ran], tmp_path: Path) -> None:
-    new_run(tmp_path / "cold", "a", result(0))
-    assert "°C" not in run("history", tmp_path / "cold")[1]
-    new_run(tmp_path / "warm", "a", result(0, temperature_C=31.4))
-    titles, row, _ = run("history", tmp_path / "warm")[1].splitlines()
-    assert titles.split()[-1] == "°C"
-    assert row.split()[-1] == "31"
 
 
 @pytest.mark.parametrize("emulated", [False, True])

@@ -151,9 +151,3 @@ def test_a_wrong_load_is_named_with_the_form_to_type(mass: str, at: str | None) 
         or "0,0,200" in str(found.exception)
         or "0 to 100 kg" in str(found.exception)
     )
-
-
-def test_no_file_is_named_with_the_command_that_makes_one(sensor: LoadedSensor) -> None:
-    del sensor
-    found = run("show")
-    assert "loads solve" in str(found.exception)

@@ -19,7 +19,6 @@ import pytest
 
 from ftdrive import cli
 from ftdrive.cell.config import CellConfig
-from ftdrive.commands.record import Duration
 from ftdrive.recording import Recorder, load_recording
 from ftdrive.recording import recorder as recorder_module
 from ftdrive.recording.growing_file import GrowingFile
@@ -201,11 +200,6 @@ def test_what_cannot_be_done_is_refused_before_any_work(run_record: Run, options
     assert words in " ".join(err.split())
 
 
-@pytest.mark.parametrize(("text", "seconds"), [("90", 90.0), ("0.5s", 0.5), ("1.5h", 5400.0)])
-def test_a_duration_has_a_unit(text: str, seconds: float) -> None:
-    assert Duration().convert(text, None, None) == seconds
-
-
 def test_a_conversion_is_complete_and_says_what_was_cut(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -271,14 +265,6 @@ def test_compensate_answers_as_documented(recorded: Path, capsys: pytest.Capture
         "b.parquet",
     )
     assert str(load_recording(Path("b.parquet")).header.frame) == "base axes, about the sensor origin"
-
-
-def test_compensate_prints_a_table(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["compensate", str(recorded), "--bias", "estimate"]) == 0
-    out = capsys.readouterr().out
-    assert "bias change ± 1 sigma" in out
-    assert "compensated: sensor axes, about the sensor origin" in out
-    assert max(map(len, out.splitlines())) <= 80
 
 
 @pytest.mark.parametrize(
@@ -418,18 +404,6 @@ def test_compensate_refuses_the_calibration_of_another_sensor(
     replace(calibration(), provenance={"devices": devices}).save(Path("other.json"))
     assert cli.run(["compensate", str(recorded), "--calibration", "other.json"]) == 2
     assert "FT9" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_compensate_imports_no_driver_of_a_device(recorded: Path) -> None:
-    code = (
-        "import sys; from ftdrive.cli import run\n"
-        f"assert run(['compensate', {str(recorded)!r}, '--json']) == 0\n"
-        "hardware = {'can', 'serial', 'rtde_receive', 'rtde_control', 'pynetft', 'ftdrivers.ati', 'ftdrivers.ur.arm'}\n"
-        "assert not hardware & sys.modules.keys(), hardware & sys.modules.keys()\n"
-    )
-    outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert outcome.returncode == 0, outcome.stderr
 
 
 def test_live_replays_a_recording_with_its_calibration_or_another(

@@ -1,7 +1,6 @@
 """`ftdrive solve` before it reads anything: which options go together."""
 
 from pathlib import Path
-from shutil import copy
 
 import pytest
 from click.testing import CliRunner
@@ -51,22 +50,3 @@ def test_each_of_several_sources_that_fail_is_named_once(tmp_path: Path, monkeyp
     assert [printed.count(name) for name in ("error: ", "first.csv", "empty")] == [2, 1, 1]
     alike = CliRunner().invoke(cli, ["solve", "a/poses.csv", "b/poses.csv"]).output
     assert [alike.count(path) for path in ("a/poses.csv", "b/poses.csv")] == [1, 1]
-
-
-@pytest.mark.parametrize(
-    ("options", "following"),
-    [
-        ("--up 0,0,1", ["report poses.csv --up 0,0,1", "solve poses.csv --up 0,0,1 -o calibration.json"]),
-        ("--from old.json --all", ["solve poses.csv --from old.json -o calibration.json"]),
-        ("-o new.json", ["report new.json", "live --calibration new.json"]),
-    ],
-)
-def test_what_is_typed_next_has_the_options_that_were_given(
-    options: str, following: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    copy(Path(__file__).parents[4] / "examples" / "poses.csv", "poses.csv")
-    for typed in ("-o old.json", options):
-        outcome = CliRunner().invoke(cli, ["solve", "poses.csv", *typed.split()])
-    commands = [line.partition(" (")[0].strip() for line in outcome.stderr.partition("Next\n")[2].splitlines()]
-    assert [one.removeprefix("ftdrive ") for one in commands if one.startswith("ftdrive ")] == following

@@ -1,33 +1,12 @@
 """What `ftdrive transcript` measures and prints of a sensor, and what it cannot record."""
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError
-from ftdrivers.interfaces import DeviceInfo
-
-
-class Sensor:
-    def __init__(self, *, silent: bool = False) -> None:
-        self.pieces_s: list[float] = []
-        self.silent = silent
-
-    def collect(self, duration_s: float) -> Any:
-        self.pieces_s.append(duration_s)
-        count = 0 if self.silent else 2 if len(self.pieces_s) == 1 else 1
-        return SimpleNamespace(wrench=np.tile([1.0, -2.0, 3.0, 0.1, -0.2, 0.3], (count, 1)) * len(self.pieces_s))
-
-    def identify(self) -> DeviceInfo:
-        return DeviceInfo("Mini45", "FT9", "2.1")
-
-    def health(self) -> Any:
-        return SimpleNamespace(lost=4)
 
 
 @pytest.mark.parametrize(

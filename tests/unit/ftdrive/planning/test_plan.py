@@ -20,7 +20,6 @@ from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan, digest, fingerprints
 from ftdrive.planning.planner import NUMBERS, TOOL_POSES, USUAL_POSTURE_RAD, guess_of, plan_for, plan_tour
 from ftdrive.planning.search.tours import shortest_tour
-from ftdrivers.sweep import Sweep
 from ftdrivers.ur.kinematics import MODELS as NOMINAL
 from ftdrivers.ur.kinematics import Array, Kinematics
 from tests.own_kinematics import drawn
@@ -200,14 +199,6 @@ def test_a_plan_that_only_another_arm_has_room_for_is_refused() -> None:
 def test_a_real_arm_has_the_wrist_tours_of_a_nominal_one() -> None:
     """Its wrist 2 is half a turn away at some poses, and a little more on a real arm."""
     assert planned(certifier_of(kinematics=drawn("UR5e", 3)), poses=12).kind == usual(12).kind == "wrist"
-
-
-def test_a_sweep_of_another_arm_is_refused() -> None:
-    plan = replace(
-        usual(), sweep=Sweep(USUAL_POSTURE_RAD.tolist(), np.zeros((3, 2)), np.ones((3, 2)), np.zeros((3, 2)), 20, 3)
-    )
-    with pytest.raises(PlanRefused, match="other kinematics"):
-        plan.of_arm(certifier_of(kinematics=drawn("UR5e")))
 
 
 def test_plan_changed_by_hand_is_refused(tmp_path: Path) -> None:

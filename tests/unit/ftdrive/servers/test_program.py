@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from ftdrive.servers.program import CODES, INTEGERS, ProgramService, doubles_of
+from ftdrive.servers.program import INTEGERS, ProgramService, doubles_of
 from ftdrive.stream.samples import WrenchFrame
 from ftdrivers.errors import StreamBroken
 from tests.unit.ftdrive.stream.simulated import calibrated, info, replayed
@@ -223,20 +223,3 @@ def test_ctrl_c_ends_the_service_while_it_starts_and_says_nothing_of_a_controlle
         cell.service.run()
     assert threading.active_count() == threads
     assert cell.said == []
-
-
-def test_answers_of_weighings_are_kept_and_others_are_not() -> None:
-    push = np.array([0, 8.0, 0, 0, 0, 0])
-    cell = Cell((POSE, NOTHING), (POSE, part(POSE, 0.8)), (POSE, push), seconds=1.2)
-    cell.run(0.2)
-    assert cell.ask(6, ZERO)["state"] == 1
-    assert cell.ask(7, STATUS, 0.02)["state"] == 1
-    assert cell.ask(8, 99, 0.02)["state"] == 3
-    cell.run(0.6)
-    assert cell.ask(9, WEIGH)["state"] == 1
-    cell.run(0.3)
-    assert cell.ask(10, WEIGH)["state"] == 3
-    assert cell.log.kept == [
-        0.8,
-        next(name for name, code in CODES.items() if code == cell.registers.written[-1]["code"]),
-    ]

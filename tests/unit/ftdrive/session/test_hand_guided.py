@@ -16,7 +16,7 @@ from ftcalib.model import Array, cross
 from ftcalib.routine import PoseRecord, dataset_from, drift_check
 from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
-from ftdrive.session.events import Compared, Estimated, Event, Key, Noted, PoseTaken, Question, StateChanged
+from ftdrive.session.events import Estimated, Event, Key, Noted, PoseTaken, Question, StateChanged
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import HandGuided
 from ftdrive.session.open_session import OpenCell, PoseBook
@@ -216,24 +216,6 @@ class Fit:
         )
 
 
-class Verification:
-    """Compares each pose with a calibration from which all differ; seven poses are enough."""
-
-    def __init__(self) -> None:
-        self.poses = 0
-
-    def add(self, record: PoseRecord) -> Compared:
-        self.poses += 1
-        return Compared(
-            stop=record.stop,
-            number=record.pose.number,
-            residual=np.full(6, 9.0),
-            sigma=np.full(6, 0.1),
-            poses=self.poses,
-            light="green" if self.poses == 7 else "amber",
-        )
-
-
 class Outcome:
     """What a collection leaves."""
 
@@ -301,12 +283,6 @@ def test_an_arm_that_hardly_rests_or_creeps_is_not_measured() -> None:
     np.testing.assert_allclose(outcome.kept[0].before.R_base_flange, FRONT.as_matrix(), atol=1e-9)
 
 
-def test_if_the_arm_moves_off_while_measured_the_time_to_wait_is_shown() -> None:
-    outcome = Outcome([*dwells(UP, seconds=2.0), *dwells(DOWN)])
-    assert outcome.stops == [1]
-    assert "moved while pose 1" in outcome.person.words()
-
-
 def test_a_repeat_is_reported_once_and_left_out() -> None:
     near = Rotation.from_euler("y", 9.0, degrees=True)
     nudged = near * Rotation.from_euler("x", 0.5, degrees=True)
@@ -347,16 +323,6 @@ def test_keys_pressed_while_a_pose_is_averaged_mean_what_is_shown_then() -> None
     assert [r.before.R_base_flange[2, 2].round(3) for r in skipped.kept] == [1.0, 0.0]
     paused = Outcome(dwells(UP, DOWN), keys={7.5: Key.PAUSE})
     assert paused.stops == [1]
-
-
-def test_a_sensor_that_recovers_is_waited_for_and_its_failure_is_reported_once() -> None:
-    outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), recover=True, unplugged_s=9.5)  # while pose 2 is averaged
-    assert outcome.stops == [1, 2, 3]
-    assert outcome.person.words().count("a cable came off") == 1
-    assert outcome.person.words().count("connected again") == 1
-    outcome = Outcome(dwells(UP, DOWN), unplugged_s=8.0, raises=pytest.raises(StreamBroken))
-    assert outcome.stops == [1]
-    assert "a cable came off" in outcome.person.words()
 
 
 @pytest.mark.parametrize(("since_s", "listen"), [(4.5, True), (8.2, False)])  # on the way; pose 2 is averaged
@@ -467,15 +433,6 @@ def test_only_standstills_of_the_running_program_count_and_the_last_though_it_ha
     rest = [record.before.R_base_flange.round(6).tolist() for record in outcome.kept]
     assert rest == [one.as_matrix().round(6).tolist() for one in (DOWN, RIGHT, FRONT)]
     assert outcome.cell.now_s < outcome.cell.end_s + 5  # by itself
-
-
-def test_a_program_that_ends_where_it_has_been_ends_it() -> None:
-    outcome = Outcome(dwells(UP, DOWN, UP), listen=True, says=lambda t: status("playing" if t < 10 else "stopped"))
-    assert outcome.stops == [1, 2]
-    *_, left_out, ended = outcome.person.words().splitlines()
-    assert "0° from pose 1" in left_out
-    assert ended.startswith("The program has ended")
-    assert outcome.cell.now_s < 13
 
 
 # ------------------------------------------------------------------ what breaks

@@ -14,13 +14,12 @@ from ftcalib import Finding, Parameters, solve
 from ftcalib.model import predict
 from ftcalib.poses.information import T12, Guess, TOOL_DOWN_R_base_flange, special
 from ftcalib.poses.selection import cone_candidates, tilted_candidates
-from ftcalib.routine import PoseRecord, TourPose, dataset_from, drift_check
+from ftcalib.routine import PoseRecord, TourPose, dataset_from
 from ftdrive.planning.search.nodes import NUMBERS
 from ftdrive.runs.load import Load
 from ftdrive.runs.pose_hints import hints
 from ftdrive.session.events import Estimated
-from ftdrive.session.live_fit import HUNG_TILT_RAD, RunningFit
-from ftdrive.terminal.report import print_result
+from ftdrive.session.live_fit import RunningFit
 from ftdrivers.interfaces import FtSamples
 from tests.known_cells import UPSIDE_DOWN
 from tests.pose_sets import AMBIGUOUS_6
@@ -249,21 +248,8 @@ def test_a_first_pose_that_is_touched_at_the_end_is_no_drift() -> None:
     assert (hint.code, hint.values["pose"]) == ("return_differs", name(1))
 
 
-def test_the_rate_of_a_drift_is_that_of_what_drifts(capsys: pytest.CaptureFixture[str]) -> None:
-    taken = disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop - 1) / 24 * np.array([0, 0, 0, 0, 0, 0.096]))
-    print_result(solve(dataset_from(taken, {})), drift=drift_check(taken), records=taken)
-    assert "away: 0.06 N·m/min" in capsys.readouterr().out
-
-
 def test_tilts_with_a_hanging_load_are_enough_for_its_run() -> None:
     """Alone they would leave the mounting uncertain, which the run of the tool has."""
     tilts = tilted_candidates(np.radians([45, 75]), 4, 0.0, (0.0, 0.0, -1.0))
     hung = Load.of("2.0", "tip=0,0,200", gripped=False)
     assert (run(records(tilts)).light, run(records(tilts), RunningFit(load=hung)).light) == ("amber", "green")
-
-
-def test_a_hint_keeps_a_hanging_load_below_the_tool() -> None:
-    (tilted,) = tilted_candidates(np.radians([60]), 1, 0.0, (0.0, 0.0, -1.0))
-    running = RunningFit(load=Load.of("2.0", "tip=0,0,200", gripped=False))
-    following = follow(running.add(record(1, tilted, 1)).hint, tilted)
-    assert -following[2, 2] >= np.cos(HUNG_TILT_RAD)

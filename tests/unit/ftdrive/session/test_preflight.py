@@ -15,8 +15,7 @@ from ftdrive.checks import computer
 from ftdrive.checks.check import Check
 from ftdrive.errors import NotAccepted
 from ftdrive.session import preflight
-from ftdrive.session.events import Checked, Noted
-from ftdrivers.errors import StreamBroken
+from ftdrive.session.events import Checked
 from ftdrivers.interfaces import ArmState, DeviceInfo, Fact
 from tests.unit.ftdrive.fake_cell import Lab
 from tests.unit.ftdrive.session.scenarios import Action, status
@@ -96,14 +95,6 @@ def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path
     assert lab.arm.moves == []
 
 
-def test_a_plan_that_has_run_before_does_not_excuse_a_wound_cable(lab: Lab) -> None:
-    lab.take_poses()
-    lab.arm.q[5] -= 2 * np.pi
-    lab.operator.shown.clear()
-    with pytest.raises(NotAccepted, match="wrist 3 is at"):
-        lab.take_poses(plan=lab.run().folder / "plan.json")
-
-
 @pytest.mark.parametrize(("outside_rad", "state"), [(1e-4, "ok"), (0.05, "failed")])
 def test_wrist_3_at_the_end_of_its_range_may_be_outside_it_by_its_joint_noise(outside_rad: float, state: str) -> None:
     low, high = np.radians([-90.0, 180.0])
@@ -154,19 +145,6 @@ def test_another_arm_than_the_one_that_is_meant_is_refused(lab: Lab) -> None:
     assert lab.take_poses(dry_run=True) is None
     lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="B2"))
     refuse(lab, r"the arm at fake has serial A1, but \[robot\] serial is B2")
-
-
-def test_a_sensor_that_stumbles_once_is_opened_again(lab: Lab) -> None:
-    def stumble() -> None:
-        lab.sensor.collecting = lambda: None
-        raise StreamBroken("a write took too long")
-
-    lab.sensor.collecting = stumble
-    assert lab.take_poses(dry_run=True) is None
-    assert "trying once more" in " ".join(event.words for event in lab.operator.of(Noted))
-    lab.sensor.failure = StreamBroken("gone for good")
-    with pytest.raises(StreamBroken):
-        lab.take_poses(dry_run=True)
 
 
 def test_a_folder_that_cannot_be_written_is_refused(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:

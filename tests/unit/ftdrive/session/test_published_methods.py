@@ -1,9 +1,7 @@
 """A calibration by a published method: its poses, its result, and the commands that continue from its run."""
 
 import json
-from pathlib import Path
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -11,9 +9,8 @@ from ftdrive.cli import cli
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.fleet.resolve import solve_run
 from ftdrive.report.subject import read_subject
-from ftdrive.runs.bundle import write_bundle
 from ftdrive.runs.run import Run
-from ftdrive.runs.source import SolveOptions, read_dataset
+from ftdrive.runs.source import SolveOptions
 from ftdrive.session.session import method_of_poses
 from tests.unit.ftdrive.fake_cell import Lab
 
@@ -66,22 +63,6 @@ def test_case_8_and_its_table_come_from_one_run(lab: Lab) -> None:
     assert "method carlson-eigen as published" in printed.stdout
     incomplete = CliRunner().invoke(cli, ["solve", folder, "--table-iii"]).exception
     assert "poses of Table III are missing" in str(incomplete)
-
-
-def test_the_test_set_is_a_bundle_or_a_table_of_either_orientation(lab: Lab, tmp_path: Path) -> None:
-    outcome = lab.calibrate()
-    assert outcome is not None
-    dataset = read_dataset(outcome.run.folder)
-    write_bundle(outcome.run.folder, bundle := tmp_path / "run.zip")
-    names = [f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)] + ["fx", "fy", "fz", "tx", "ty", "tz"]
-    rows = np.hstack([np.swapaxes(dataset.R_base_flange, 1, 2).reshape(-1, 9), dataset.wrench])
-    np.savetxt(table := tmp_path / "poses.csv", rows, delimiter=",", header=",".join(names), comments="")
-    for test in (bundle, table):
-        command = ["solve", str(table), "--method", "all", "--test", str(test), "--json"]
-        answer = CliRunner().invoke(cli, [*command, "--orientation", "R_flange_base"])
-        document = json.loads(answer.stdout)
-        assert (document["test_set"], document["as_published"]) == (str(test), False)
-        assert document["methods"][0]["test"]["largest"]["force_N"] < 0.1
 
 
 def test_methods_that_poses_alone_do_not_serve_are_refused() -> None:

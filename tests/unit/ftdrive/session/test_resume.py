@@ -22,10 +22,9 @@ from ftdrive.session.events import (
     PoseTaken,
     RunOpened,
 )
-from ftdrive.words.result import drift_in_words
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
 from tests.unit.ftdrive.fake_cell import Lab
-from tests.unit.ftdrive.session.scenarios import Case, at, both, cases, once, press
+from tests.unit.ftdrive.session.scenarios import Case, cases, once, press
 
 
 def broken_off(lab: Lab, mode: str = "auto") -> Path:
@@ -81,32 +80,6 @@ WHILE_IT_STANDS = {
 @cases(ON_ITS_WAY | WHILE_IT_STANDS)
 def test_a_key(case: Case, lab: Lab) -> None:
     case.play(lab)
-
-
-def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> None:
-    at(lab, "taken 3", both(press(Key.REDO), lambda lab: at(lab, "measuring 3", press(Key.SKIP))))
-    outcome = lab.calibrate()
-    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
-    assert "pose 3 keeps" in lab.said()
-    assert outcome is not None
-    assert outcome.result.n_poses == 6
-    assert [event.poses for event in lab.operator.of(Estimated)][:5] == [1, 2, 3, 3, 4]
-
-
-def test_a_first_pose_that_is_repeated_after_its_return_gives_the_drift_between_the_two(lab: Lab) -> None:
-    lab.take_poses()
-    lab.sensor.push = np.array([0.5, 0, 0, 0, 0, 0])
-    outcome = lab.calibrate(resume=lab.run().folder, redo=(1,))
-    assert lab.taken()[-1] == 1
-    assert outcome is not None
-    assert outcome.result.n_poses == 6
-    drift = outcome.drift
-    assert drift is not None
-    assert -60 < drift.elapsed_s < 0
-    assert drift.change[0] == pytest.approx(-0.5, abs=0.05)  # per time it rises all the same
-    words, bad = drift_in_words(drift)
-    assert bad
-    assert words.startswith(f"first pose, repeated {-drift.elapsed_s:.0f} s after the return to it, 0.")
 
 
 def test_an_approach_past_a_skipped_pose_is_shown_and_confirmed_by_the_operator(

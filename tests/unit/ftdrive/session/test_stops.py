@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from ftcalib.routine import PoseRecord
 from ftdrive.errors import SupervisorGone
@@ -27,8 +26,6 @@ from tests.unit.ftdrive.session.scenarios import (
     status,
     turn,
 )
-
-Array = NDArray[np.float64]
 
 
 def lose_controller(lab: Lab) -> None:

@@ -3,23 +3,21 @@
 import json
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ftcalib.sampling import Sampling
 from ftdrive.cell.config import WorkcellConfig
-from ftdrive.errors import Declined, NotAccepted
+from ftdrive.errors import NotAccepted
 from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, guess_of, plan_tour
 from ftdrive.session import preflight
 from ftdrive.session.along_plan import has_completed, remember_completed
 from ftdrive.session.drive import Progress
-from ftdrive.session.events import Asked, Checked, Key, Noted, Planned, PoseTaken, RunOpened, State
-from ftdrive.session.guards import Limits, StallGuard
-from ftdrive.words.session import SessionText, in_words
+from ftdrive.session.events import Asked, Checked, Key, Noted, Planned, PoseTaken, State
+from ftdrive.words.session import in_words
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from tests.unit.ftdrive.fake_cell import MODEL, Lab
 from tests.unit.ftdrive.session.scenarios import Case, once, press
@@ -137,19 +135,6 @@ def test_a_run_counts_as_complete_if_every_move_of_the_plan_was_driven(what: str
     assert has_run(lab) == complete
 
 
-@pytest.mark.slow
-def test_a_plan_counts_once_all_its_poses_are_taken_again(lab: Lab) -> None:
-    lab.operator.answers["Pose 3 of 7"] = ["s"]
-    lab.take_poses(mode="step")
-    lab.take_poses(resume=lab.run().folder, mode="auto")
-    lab.operator.shown.clear()
-    lab.take_poses(resume=lab.run().folder)  # nothing is left to take: nothing to be said of moves
-    assert "slow again" not in lab.said()
-    lab.take_poses(resume=lab.run().folder, redo=(1, 2, 3, 4, 5, 6, 7), fast=True)
-    assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
-    assert has_run(lab)
-
-
 def test_an_arm_that_reports_no_serial_number_runs_slowly_each_time_and_the_reason_is_said(lab: Lab) -> None:
     lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
     for _ in range(2):
@@ -211,27 +196,6 @@ def test_a_way_of_the_whole_arm_is_confirmed_by_a_person_though_the_plan_is_know
     assert ("elbow 9°" in way and "whole arm" in way) != assumed
 
 
-def test_a_run_that_goes_on_from_elsewhere_is_confirmed_by_a_person(lab: Lab) -> None:
-    lab.trust()
-    for joint, assumed in ((5, True), (0, False)):
-        lab.operator.asked.clear()
-        lab.operator.shown.clear()
-        lab.arm.moves.clear()
-        lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
-        with pytest.raises(Declined):
-            lab.take_poses()
-        lab.arm.q = lab.arm.q + np.radians(9.0) * (np.arange(6) == joint)
-        lab.operator.asked.clear()
-        lab.take_poses(resume=Path(lab.operator.of(RunOpened)[-1].folder))
-        assert [question.assumed is not None for question in lab.operator.asked] == [assumed] * 4
-
-
-def test_the_plan_of_a_dry_run_is_looked_at_until_enter(lab: Lab) -> None:
-    assert lab.take_poses(dry_run=True, watch=lambda *_: StallGuard(Limits())) is None
-    assert [question.answers for question in lab.operator.asked] == [("",)]
-    assert lab.arm.moves == []
-
-
 def test_step_mode_waits_for_enter_before_each_move(lab: Lab) -> None:
     lab.operator.answers["Pose 3 of 7"] = ["s"]
     lab.operator.answers["Pose 5 of 7"] = ["r", ""]
@@ -245,30 +209,6 @@ def test_step_mode_waits_for_enter_before_each_move(lab: Lab) -> None:
     assert asked == [f"Pose {stop} of 7" for stop in (1, 2, 3, 4, 5, 4, 5, 6, 7)]
     assert lab.stops() == [1, 2, 4, 5, 6, 7]
     assert (lab.run().folder / "poses" / "04-2.npz").exists()
-
-
-def test_step_mode_says_what_enter_does(lab: Lab) -> None:
-    lab.operator.answers["Pose 3 of 7"] = ["r", ""]
-    lab.take_poses(mode="step")
-    steps = Plan.load(lab.run().plan_path).steps
-    asked = [question.text for question in lab.operator.asked if question.text.startswith("Pose")]
-    assert "Enter plans and shows the approach" in asked[0]
-    for text, start, goal in ((asked[1], 0, 1), (asked[4], 1, 2), (asked[5], 2, 3)):
-        turn_deg = np.degrees(np.abs(np.subtract(steps[goal].q_rad, steps[start].q_rad)))
-        joints = ", ".join(str(joint + 1) for joint in np.flatnonzero(turn_deg > 0.5))
-        assert f"joint{'s' if ',' in joints else ''} {joints}, largest turn {turn_deg.max():.0f}°" in text
-        assert "at 30 °/s" in text  # slow, as in any first run
-    assert "Enter starts the measurement" in asked[3]  # pose 2 again, where the arm is
-    assert "moves" not in asked[3]
-
-
-def test_the_plan_shows_how_the_arm_stops(lab: Lab) -> None:
-    lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, stop_deceleration_deg_s2=150.0))
-    lab.take_poses(dry_run=True)
-    (planned,) = lab.operator.of(Planned)
-    assert "150 °/s²" in planned.stop_words
-    assert planned.stop_words in in_words(planned)
-    assert any(planned.stop_words in line.words for line in SessionText().lines(planned))
 
 
 def begun() -> Progress:

@@ -1,12 +1,10 @@
 """A sensor alone: its readings minus a tare, without a word about an arm or a calibration."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ftdrive import cli
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.recording.compensation import compensate_recording
 from ftdrive.recording.foreign import TablePair
@@ -14,13 +12,9 @@ from ftdrive.recording.recorder import RawTable
 from ftdrive.stream.sources import CellSource
 from ftdrive.stream.stream import Stream
 from ftdrive.tables.table import Table
-from ftdrive.terminal.live_screen import LiveScreen, draw_live
-from ftdrive.words.stream import StreamSummary
-from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.stream.simulated import NOISE, calibrated
 from tests.unit.ftdrive.stream.test_stream import RATE_HZ, Sensor
-from tests.unit.ftdrive.terminal.fake_stream import SteppedFeed
 
 LOAD = np.array([30.0, -20.0, 80.0, 2.0, -1.0, 0.5])
 
@@ -57,52 +51,6 @@ def test_readings_are_as_measured_and_a_tare_is_subtracted(sensor: Sensor) -> No
         assert (block.wrench == block.raw).all()
         assert stream.undo_tare().kind == "tare-refused"
         assert not {"contact", "drift"} & {event.kind for event in stream.take_events()}
-
-
-def test_a_silent_sensor_raises_and_recovers(sensor: Sensor) -> None:
-    with raw(sensor) as stream:
-        stream.read()
-        sensor.silent = True
-        with pytest.raises(DeviceTimeout):
-            list(stream)
-        status = stream.status()
-        assert status.sensor.error
-        assert not status.arm.error
-        sensor.silent = False
-        assert len(stream.read())
-
-
-def test_the_screen_shows_readings_and_nothing_unknown(sensor: Sensor) -> None:
-    with raw(sensor) as stream:
-        feed = SteppedFeed(stream)
-        summary = StreamSummary(feed)
-        screen = LiveScreen(feed, summary)
-        feed.step(220)
-        for key in ("t", "x", "1"):
-            screen.press(key)
-        feed.step(60)
-        view = summary.view()
-    for size in ((80, 24), (120, 40)):
-        lines = [str(line) for line in draw_live(view, *size)]
-        text = "\n".join(lines)
-        assert {len(line) for line in lines} == {size[0]}
-        assert "sensor alone: no arm, no calibration  tare" in lines[2]
-        assert "minus tare" in lines[1]
-        assert "raw readings have no stages and no other axes" in text
-        for word in ("GOOD", "cal ", "robot", "payload", "drift", "free ", "CONTACT", "bias", "noise not known"):
-            assert word not in text, word
-
-
-def test_a_program_gets_readings_and_no_verdict(
-    sensor: Sensor, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    sensor.push = LOAD
-    monkeypatch.setattr("ftdrive.commands.live.CellSource", lambda *_: raw(sensor).source)
-    assert cli.run(["live", "--raw", "--sensor", "fake://", "--once", "--json"]) == 0
-    reading = json.loads(capsys.readouterr().out)
-    assert reading["raw"]["force_N"] == pytest.approx((sensor.motion.wrench(np.zeros(1))[0] + LOAD)[:3], abs=0.05)
-    for name in ("compensated", "contact", "calibration", "calibration_id", "verdict", "delay_s", "verification"):
-        assert reading[name] is None
 
 
 def test_what_is_saved_is_compensated_beside_a_table_of_poses(sensor: Sensor, tmp_path: Path) -> None:

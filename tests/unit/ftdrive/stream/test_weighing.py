@@ -12,7 +12,6 @@ import ftdrive
 from ftcalib import CalibrationResult
 from ftcalib.model import Array
 from ftcalib.sensor_matrix import SensorMatrix
-from ftdrive.errors import ConfigError
 from ftdrive.stream.noise import unexplained_variance
 from ftdrive.stream.samples import Paired
 from ftdrive.stream.stream import Stream
@@ -176,15 +175,6 @@ def test_a_push_in_motion_is_refused_until_it_is_over() -> None:
             weigh_in_motion(source)
         assert refusal.value.code == "undecided"
         read(source, 0.4)
-
-
-def test_weighing_in_motion_needs_a_stream_that_follows() -> None:
-    source = carried(0.0)
-    with pytest.raises(CannotWeigh, match="too few samples"):
-        weigh_in_motion(source)
-    source.track = "off"
-    with pytest.raises(ConfigError, match="track"):
-        weigh_in_motion(source)
 
 
 def test_parts_are_counted_or_not() -> None:

@@ -93,22 +93,6 @@ def test_lines_that_changed_are_sent_until_q_and_then_what_was_printed() -> None
     assert text.index("a warning") > text.index(LEFT)
 
 
-def test_the_key_v_shows_the_code_of_the_page_until_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ftdrive.terminal.canvas.qr_code", lambda address: [f"code of {address}"])  # of an extra
-    canvas = Counting(url := "http://127.0.0.1:8080/?token=abc")
-    assert str(canvas.page()) == f"─ {url}  v QR code"
-    canvas.press("v")
-    lines = [str(line).rstrip() for line in canvas.lines(80, 24)]
-    assert (lines[0], lines[2]) == (f" {url}", f" code of {url}")
-    assert "--view-address" in lines[1]
-    canvas.press("x")
-    assert str(canvas.lines(80, 24)[0]).startswith("drawn")
-    assert canvas.heard == []
-    canvas = Counting()
-    canvas.press("v")
-    assert (canvas.heard, canvas.page()) == (["v"], None)
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_and_only_ctrl_c_does_as_q(number: signal.Signals) -> None:
     def does(person: int, _: int) -> Shown:

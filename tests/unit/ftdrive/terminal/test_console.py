@@ -24,12 +24,8 @@ from ftdrive.cli import run as cli_run
 from ftdrive.errors import Declined, in_a_sentence
 from ftdrive.planning import planner
 from ftdrive.planning.plan import Plan
-from ftdrive.session.events import Noted, Question
-from ftdrive.terminal import console
 from ftdrive.terminal.console import answer, indented, messages
 from ftdrive.terminal.lines import Line
-from ftdrive.terminal.operators import PlainOperator
-from ftdrive.terminal.screen import open_operator
 from ftdrive.terminal.text import echo, in_whole_words, print_table
 from ftdrive.words.text import visible
 
@@ -109,20 +105,6 @@ def test_quiet_leaves_only_errors_and_the_answer(monkeypatch: pytest.MonkeyPatch
     assert '"steps"' in run("-q", *PLAN, "--json").stdout
 
 
-def test_quiet_asks_with_all_that_a_question_is_about(monkeypatch: pytest.MonkeyPatch) -> None:
-    stderr = io.StringIO()
-    operator = PlainOperator(stdin=io.StringIO("yes\n"), stderr=stderr, quiet=True)
-    operator.show(Noted(words="the arm goes there"))
-    assert stderr.getvalue() == ""
-    assert operator.ask(Question("Go?")) == "yes"
-    operator.show(Noted(words="it went"))
-    assert stderr.getvalue().splitlines() == ["   the arm goes there", "Go? [yes/no] yes"]
-    monkeypatch.setattr(messages, "quiet", True)
-    with open_operator() as chosen:
-        assert isinstance(chosen, PlainOperator)
-        chosen.show(Noted(words="not printed"))
-
-
 def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path, snapshot: SnapshotAssertion) -> None:
     with pytest.raises(OSError, match="No such file") as error:
         (tmp_path / "gone").read_text()
@@ -130,28 +112,6 @@ def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path, 
     assert in_a_sentence(OSError(ENOSPC, "No space left on device")) == snapshot
     own = FileExistsError("it is there: choose another name")
     assert in_a_sentence(own) == str(own)
-
-
-def test_an_address_stays_on_one_line_and_is_a_link_where_the_terminal_can(monkeypatch: pytest.MonkeyPatch) -> None:
-    url = "https://app.foxglove.dev?ds=foxglove-websocket&ds.url=ws%3A%2F%2F127.0.0.1%3A34567"
-    for is_terminal, width, lines in ((True, 40, 1), (True, 90, 2), (False, 40, 1)):
-        file = io.StringIO()
-        monkeypatch.setattr(
-            console,
-            "messages",
-            Console(
-                file=file,
-                width=width,
-                soft_wrap=not is_terminal,
-                force_terminal=is_terminal,
-                color_system="standard" if is_terminal else None,
-            ),
-        )
-        console.print_address("  In a browser:          ", url)
-        shown = file.getvalue()
-        assert url in shown
-        assert shown.count("\n") == lines
-        assert (f";{url}\x1b\\" in shown) is is_terminal
 
 
 def test_80_columns_hold_whole_words_and_commands_that_a_shell_reads(
@@ -237,21 +197,3 @@ def test_a_broken_pipe_of_a_device_is_no_closed_output(
     monkeypatch.setattr("ftdrive.commands.calibrate.run_calibration", lose)
     assert cli_run(HELD) == 4
     assert "closed its connection" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
-def test_a_closed_pipe_ends_what_prints_again_and_again() -> None:
-    forever = (
-        "import sys, ftdrive.cli as cli, click\n"
-        "from ftdrive.terminal.text import echo\n"
-        "def forever():\n    while True: echo('line')\n"
-        "cli._LazyGroup.get_command = lambda *_: click.Command('x', callback=forever)\n"
-        "sys.exit(cli.main())"
-    )
-    assert ended(forever, "x") == (141, "")
-
-
-def test_a_command_without_output_does_its_work() -> None:
-    command = [sys.executable, "-c", f"import sys; sys.stdout = None; {MAIN}", "export", "formats"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")

@@ -4,15 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from syrupy.assertion import SnapshotAssertion
 
-from ftcalib.model import Array
 from ftdrive.runs.calibration import FOREIGN
 from ftdrive.stream.feed import FeedNote
 from ftdrive.stream.samples import Stages, WrenchFrame
 from ftdrive.terminal import live_panels
 from ftdrive.terminal.lines import GOOD, WARNING, Line
-from ftdrive.terminal.live_panels import other_wrench_lines, sphere
+from ftdrive.terminal.live_panels import other_wrench_lines
 from ftdrive.terminal.live_screen import draw_live
 from ftdrive.words.stream import View, line_of_force
 from ftdrivers.interfaces import Fact
@@ -75,27 +73,6 @@ def test_the_wrench_is_shown_with_fewer_stages_and_in_other_frames(view: View) -
     np.testing.assert_allclose(found["base @ tcp"][:3], R_BASE_FLANGE @ R_flange_sensor @ push[:3], atol=0.0051)
     silent = [text(line) for line in other_wrench_lines(replace(view, reading=reading, silent="the arm"))]
     assert all(line.count("--.--") == 6 for line in silent[1:])
-
-
-def directions(*angles_deg: float) -> Array:
-    """Directions at these angles from that of gravity, in flange axes."""
-    down = R_BASE_FLANGE.T @ PARAMETERS.gravity_force_base_N
-    down /= np.linalg.norm(down)
-    across = np.cross(down, [1.0, 0.0, 0.0])
-    across /= np.linalg.norm(across)
-    return np.array([np.cos(a) * down + np.sin(a) * across for a in np.radians(angles_deg)])
-
-
-def test_the_sphere_says_how_near_the_calibrated_orientations_are(view: View, snapshot: SnapshotAssertion) -> None:
-    reading = replace(reading_of(view), R_base_flange=R_BASE_FLANGE)
-    lines = sphere(replace(view, reading=reading, calibrated=directions(70, 23, 110)))
-    assert "\n".join(text(line).rstrip() for line in lines) == snapshot
-    variances = np.diag(view.info.calibration.wrench_covariance(R_BASE_FLANGE))
-    sigma = f"{np.sqrt(variances[:3].sum()):.3f} N, {1e3 * np.sqrt(variances[3:].sum()):.2f} mN·m"
-    assert text(lines[8]).rstrip().endswith(sigma)
-    assert sum(text(line).count("●") for line in lines) == 2  # one is in the words
-    unknown = sphere(replace(view, reading=reading, calibrated=None))
-    assert "calibrated:" not in "".join(map(text, unknown))
 
 
 @pytest.mark.parametrize(

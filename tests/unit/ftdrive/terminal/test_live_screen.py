@@ -20,9 +20,8 @@ from ftdrive.terminal.console import messages
 from ftdrive.terminal.live_screen import LiveScreen, draw_live, run_live
 from ftdrive.words.stream import StreamSummary
 from ftdrivers.errors import DeviceTimeout
-from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.stream.simulated import calibrated, dwells, info, paired, replayed
-from tests.unit.ftdrive.terminal.fake_stream import SIGMA, FakeStream, Scenario, SteppedFeed
+from tests.unit.ftdrive.terminal.fake_stream import FakeStream, Scenario, SteppedFeed
 from tests.wire.waiting import wait_until
 
 CHECKS = (
@@ -107,15 +106,6 @@ def test_keys_change_frame_and_stages_and_the_screen_says_what_the_numbers_are()
     assert "weight included, tcp @ flange" in lines[1]
 
 
-def test_a_frame_that_is_not_configured_is_left_out_and_named() -> None:
-    screen, rows = Screen(blocks=0), paired(dwells(1, 2000, seed=1), rate_Hz=100.0)
-    screen.show(replayed(info(calibrated(), height=False), rows, clock=FakeClock()))
-    screen.step(3)
-    screen.press("a")
-    assert any("set [sensor] height_mm" in note.text for note in screen.summary.view().notes)
-    assert screen.stream.frame == WrenchFrame()
-
-
 def test_keys_tare_undo_and_mark() -> None:
     screen = Screen()
     assert "text, then Enter; Esc cancels" in screen.press("t", "b")[-1]
@@ -137,15 +127,6 @@ def test_a_key_pushes_the_tool_of_an_emulated_cell_only() -> None:
     assert "the emulated tool is pushed" in lines[-3]
 
 
-def test_freeze_span_and_peaks() -> None:
-    screen = Screen()
-    assert float(screen.lines()[8].split("free")[0].split()[-1]) > 7.5
-    lines = screen.press("p", "g", "z")
-    assert "FROZEN" in lines[0]
-    assert float(lines[8].split("free")[0].split()[-1]) < 7 * SIGMA[0]
-    assert "60 s" in lines[4]
-
-
 def test_a_replay_pauses_steps_seeks_and_says_where_it_is() -> None:
     rows = paired(dwells(1, 2000, seed=1), rate_Hz=100.0)
     screen, stream = Screen(blocks=0), replayed(info(calibrated()), rows)
@@ -165,16 +146,6 @@ def test_a_replay_pauses_steps_seeks_and_says_where_it_is() -> None:
     assert ", x 2" in lines[0]
     assert "space pause" in lines[-1]
     assert "+0.0" in lines[5] or "-0.0" in lines[5]
-
-
-def test_help_covers_the_screen_until_a_key() -> None:
-    screen = Screen()
-    lines = screen.press("?")
-    assert "tare: change the bias so that a free tool reads zero" in "".join(lines)
-    assert "Any key returns." in "".join(lines)
-    assert not [line for line in lines if "…" in line]
-    assert "Fx" in screen.press("t")[5]
-    assert not screen.stream.called
 
 
 class Other(FakeStream):

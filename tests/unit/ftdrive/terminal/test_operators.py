@@ -152,23 +152,6 @@ def test_what_was_typed_before_a_question_is_no_answer_to_it() -> None:
     os.close(person)
 
 
-def test_checks_that_pass_share_a_line_and_details_need_verbose() -> None:
-    checks = [Checked(name=name, passed=name != "load", words=f"about {name}") for name in ("robot", "load", "disk")]
-
-    def printed(verbose: bool) -> list[str]:
-        operator = PlainOperator(stdin=io.StringIO(), stderr=(stderr := io.StringIO()), verbose=verbose)
-        for check in checks:
-            operator.show(check)
-        operator.show(estimated(hint=""))
-        operator.finish()
-        return stderr.getvalue().splitlines()
-
-    assert printed(verbose=False) == ["Checks", " ✔ robot", " ✘ load: about load", " ✔ disk"]
-    brief_of_each = [f" {mark} {name}: about {name}" for mark, name in (("✔", "robot"), ("✘", "load"), ("✔", "disk"))]
-    assert printed(verbose=True)[:4] == ["Checks", *brief_of_each]
-    assert "coverage amber" in printed(verbose=True)[4]
-
-
 def test_a_terminal_that_cannot_discard_early_answers_gives_none(monkeypatch: pytest.MonkeyPatch) -> None:
     class Terminal(io.StringIO):
         def isatty(self) -> bool:

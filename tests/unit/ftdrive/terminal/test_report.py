@@ -98,20 +98,6 @@ def terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
 
 
-@pytest.mark.parametrize("width", [44, 80])
-def test_lines_of_the_report_go_on_under_their_text(
-    width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    terminal(monkeypatch, width)
-    result = solve(tilted(), known=Known(mass_kg=0.61))
-    print_result(result, every=True)
-    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
-    assert max(map(len, lines)) <= width
-    start = next(i for i, line in enumerate(lines) if line.startswith(" REJECTED"))
-    assert "…" not in "".join(lines)
-    assert all(re.match(r" (\w[\w ]*:| {2,}) ?\S", line) for line in lines[start + 1 :])
-
-
 @pytest.mark.parametrize(
     ("option", "value", "words"),
     [
@@ -267,19 +253,6 @@ def test_the_table_has_the_estimates_in_the_units_that_it_names(
     expected = {name.format(axis): v for name, values in vectors.items() for axis, v in zip("xyz", values, strict=True)}
     tilt = {"mass, kg": 2.0, "base tilt alpha, deg": 0.0, "base tilt beta, deg": -np.degrees(0.02)}
     assert found == pytest.approx({**expected, **tilt}, abs=6e-4)
-
-
-def test_the_truth_stands_beside_with_the_error_in_sigmas(capsys: pytest.CaptureFixture[str]) -> None:
-    truth = followed().to_dict() | {
-        "mass_kg": 2.0 - 3 * followed().sigma["mass_kg"],
-        "force_bias_N": [0.995, -2.0, 0.0],
-    }
-    print_result(followed(), truth=truth)
-    out = capsys.readouterr().out
-    rows = rows_of(out)
-    assert rows["mass, kg"][-1] == "+3.0"
-    assert rows["force bias x, N"] == ["0.9950", "1.0000", "0.0010", "+5.0"]
-    assert "truth: a free tool reads 0.0050 N, 0.00000 N·m rms; before 19.7 N, 0.96 N·m" in out
 
 
 def drifted(change: float, *, torque: float = 0.0, elapsed_s: float = 120.0) -> DriftCheck:

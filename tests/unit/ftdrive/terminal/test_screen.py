@@ -22,7 +22,6 @@ from rich.console import Console
 from syrupy.assertion import SnapshotAssertion
 
 from ftdrive.session.events import (
-    Asked,
     Checked,
     Compared,
     Estimated,
@@ -39,7 +38,7 @@ from ftdrive.session.events import (
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator
 from ftdrive.terminal.screen import Screen, draw_session, open_operator
-from ftdrive.words.session import SessionText, SessionView
+from ftdrive.words.session import SessionView
 from tests.wire.waiting import wait_until
 
 RESUME = "ftdrive calibrate --resume runs/2026-11-20T211503Z-gripper_a"
@@ -183,17 +182,6 @@ def test_nothing_wraps_and_what_matters_most_stays(width: int, height: int) -> N
         assert "AMBER" in text
         assert "mass kg" in text
         assert "0.0011" in text or width < 50
-
-
-def test_the_tour_of_a_resumed_run_begins_behind_its_checks() -> None:
-    text = SessionText(poses=False)
-    events = (
-        RunOpened(folder="runs/a", resume=RESUME),
-        Checked(name="plan", passed=True, words=""),
-        StateChanged(state=State.APPROACH, words="to pose 7"),
-    )
-    shown = [line.words for event in events for line in text.lines(event)]
-    assert [words for words in shown if words in {"Checks", "Tour"}] == ["Checks", "Tour"]
 
 
 @contextmanager
@@ -346,27 +334,6 @@ def test_the_screen_draws_asks_and_goes_on() -> None:
             assert operator.pressed() is None
         assert termios.tcgetattr(program) == before
         wait_until(lambda: shown.text.count("\x1b[?25l") == shown.text.count("\x1b[?25h"))  # the cursor is back
-
-
-def test_a_terminal_that_knows_only_ascii_gets_ascii() -> None:
-    file = io.TextIOWrapper(io.BytesIO(), encoding="ascii")  # would raise at anything else
-    console = Console(file=file, width=80, height=24, force_terminal=True, color_system=None)
-    with Screen(console, stdin=io.StringIO()) as operator:
-        for event in (*MIDDLE, Noted(words="±0.1 N·m at 90°", warning=True)):
-            operator.show(event)
-    file.seek(0)
-    text = file.read()
-    assert "+- 0.0011" in text
-    assert "|-y 3*|" in text
-
-
-def test_enter_in_step_mode_leaves_no_line_behind() -> None:
-    console = Console(file=(file := io.StringIO()), width=80, height=24, force_terminal=True, color_system=None)
-    with Screen(console, stdin=io.StringIO()) as operator:
-        operator.show(Asked(question="Pose 3 of 25: Enter moves joint 4", answer="", by="person"))
-        operator.show(Asked(question="Is the tool free?", answer="yes", by="--yes"))
-    assert "Enter moves" not in file.getvalue()
-    assert "free? yes (--yes)" in file.getvalue()
 
 
 def test_a_long_finding_goes_on_under_its_text() -> None:

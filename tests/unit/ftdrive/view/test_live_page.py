@@ -4,7 +4,6 @@ import json
 import time
 import weakref
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -12,12 +11,8 @@ import pytest
 from syrupy.assertion import SnapshotAssertion
 
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
-from ftdrive.commands.options import ViewOptions
-from ftdrive.errors import ConfigError
-from ftdrive.library import certifier_of
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.planner import certifier_for
-from ftdrive.recording import Recorder
 from ftdrive.stream.samples import WrenchFrame
 from ftdrive.stream.weighing import ScaleState
 from ftdrive.view.live_page import LivePage, WeighPage
@@ -152,16 +147,6 @@ def _still(certifier: Certifier) -> set[str]:
     return {name for name in parts_of(Shown(FakeStream(), certifier=certifier).page) if name.startswith("scene/")}
 
 
-def test_the_legend_names_each_colour_of_the_scene() -> None:
-    parts = Shown(FakeStream("contact", block_s=0.05), certifier=certifier_for(CELL, "ur5e")).run(240)
-    named = {colour for colour, *_ in parts["scene/legend"]["rows"]}
-    drawn = {part["colour"] for name, part in parts.items() if name.startswith("scene/") and "colour" in part}
-    assert drawn <= named
-    assert {"force", "torque", "arm", "tool", "x", "y", "z"} <= named
-    assert parts["scene/base"]["named"]
-    assert any(part.get("alpha", 1) < 1 for part in parts.values() if part.get("colour") == "tool")
-
-
 def test_without_a_viewer_nothing_is_shown_and_nothing_piles_up() -> None:
     alive: list[weakref.ref[Any]] = []
 
@@ -200,25 +185,6 @@ def test_viewers_tare_and_choose_the_frame_only_if_that_is_allowed() -> None:
     assert "terminal" in parts["controls/frame"]["note"]
     with pytest.raises(ValueError, match="cannot have this value"):
         shown.act("axes", "world")
-
-
-def test_a_frame_that_is_not_configured_is_explained() -> None:
-    rows = paired(dwells(1, 3000, seed=1))
-    replay = replayed(info(calibrated(), height=False), rows)
-    shown = Shown(replay, controls=True)
-    shown.run()
-    with pytest.raises(ValueError, match=r"set \[sensor\] height_mm"):
-        shown.act("about", "flange")
-    assert replay.frame == WrenchFrame()
-
-
-def test_the_span_of_the_plots_is_chosen() -> None:
-    shown = Shown(FakeStream(block_s=0.05))
-    assert shown.run(60)["plots"]["span_s"] == pytest.approx(10, rel=0.01)
-    shown.act("span", "2 s")
-    parts = shown.run()
-    assert parts["plots"]["span_s"] == pytest.approx(2, rel=0.01)
-    assert control(parts, "span")["value"] == "2 s"
 
 
 def test_a_viewer_of_a_replay_pauses_and_goes_elsewhere() -> None:
@@ -263,14 +229,6 @@ def test_a_failed_drawing_is_said_once_and_ends_nothing_else(monkeypatch: pytest
     assert "\n" not in words
 
 
-def test_options_that_would_be_ignored_are_refused() -> None:
-    with pytest.raises(ConfigError, match="--allow-control is only for --view"):
-        ViewOptions(False, None).require(once=False, allow_control=True)
-    with pytest.raises(ConfigError, match="--view cannot be combined with --once"):
-        ViewOptions(False, "0.0.0.0:8080").require(once=True, allow_control=False)
-    ViewOptions(False, None).require(once=True, allow_control=False)
-
-
 def weighed(
     shown: ScaleState, *, zeroed_s: float = np.inf, moving: bool = False, controls: bool = False, note: str = ""
 ) -> tuple[dict[str, Any], Page, FakeWeighing]:
@@ -313,18 +271,3 @@ def test_a_viewer_zeroes_the_scale_only_if_that_is_allowed() -> None:
     _, page, weighing = weighed(ScaleState(PART, None), controls=True)
     page.act("viewer 2", "zero", None)
     assert weighing.is_zeroing
-
-
-def test_a_recording_brings_its_arm_and_tool(tmp_path: Path) -> None:
-    recorder = Recorder([path := tmp_path / "peg.mcap"], INFO, CELL.to_dict())
-    recorder.add(FakeStream().read(), [])
-    recorder.end()
-    stream, said = FakeStream(), list[str]()
-    assert (certifier := certifier_of(stream, path, said.append)) is not None
-    assert [part.to_m for part in certifier.arm.tool] == [0.2]
-    (table := tmp_path / "table.csv").write_text("t,fx\n0,1\n")
-    assert certifier_of(stream, table, said.append) is None
-    assert not said
-    stream.cell = replace(CELL, tool=ToolConfig())
-    assert certifier_of(stream, None, said.append) is None
-    assert "the tool is not described" in said[0]

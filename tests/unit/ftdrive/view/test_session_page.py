@@ -36,7 +36,7 @@ from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.session import Calibrating
 from ftdrive.session.verifying import Verifying
 from ftdrive.view import session_page
-from ftdrive.view.outcome import conclude_calibration, conclude_verification, on_page
+from ftdrive.view.outcome import conclude_verification, on_page
 from ftdrive.view.page import Page
 from ftdrive.view.scene import arm_parts
 from ftdrive.view.session_page import Onlooker, SessionPage
@@ -253,21 +253,6 @@ def test_the_arm_and_its_next_pose_are_drawn(lab: Lab, page: Page) -> None:
     assert not [name for name in ended if name.startswith("scene/ghost")]
 
 
-def test_poses_have_the_colour_of_their_residual(watched: Watched) -> None:
-    for stop, sigmas in ((1, None), (2, 1.0), (3, 4.0), (4, 20.0)):
-        watched.show(pose(stop, (0.0, 0.0, 1.0)))
-        watched.show(estimated(sigmas))
-    before = watched.shown()
-    assert before["scene/gravity/poses"]["colours"] == ["unknown", "good", "warn", "bad"]
-    named = {(colour, words) for colour, _, words in before["scene/legend"]["rows"]}
-    assert {colour for colour, words in named if words.startswith("pose, ")} == {"unknown", "good", "warn", "bad"}
-    watched.show(pose(2, (1.0, 0.0, 0.0)))
-    watched.show(Compared(stop=2, number=2, residual=np.ones(6), sigma=np.full(6, 0.1), poses=4, light="green"))
-    dots = watched.shown()["scene/gravity/poses"]
-    assert dots["colours"][1] == "bad"
-    np.testing.assert_allclose(dots["points"][1] / np.linalg.norm(dots["points"][1]), np.eye(3)[0], atol=1e-3)
-
-
 @pytest.mark.parametrize(
     ("range_N", "zero", "wrench"),
     [(100.0, 0.0, [25.0, -49.0, 0.0, 0.0, 0.0, 1.0]), (100.0, 20.0, [45.0] + [20.0] * 5), (None, 0.0, [45.0] * 6)],
@@ -445,21 +430,6 @@ def test_an_early_end_is_shown_as_the_terminal_says_it(
     assert "--resume" in "".join(kept)
     assert parts["state"]["head"] == "ended"
     assert not set(parts) & {"stop", "alert", "question", "bars"}
-
-
-def test_a_calibration_ends_with_verdict_estimates_and_next_command(lab: Lab, page: Page) -> None:
-    outcome = lab.calibrate()
-    assert isinstance(outcome, Outcome)
-    conclude_calibration(page, outcome.result, ["ftdrive live"])
-    parts = parts_of(page)
-    assert (parts["result"]["head"], parts["result"]["tone"]) in (("GOOD", "good"), ("USABLE", "warn"))
-    figures = {row["label"]: row for row in parts["result/figures"]["rows"]}
-    assert list(figures) == ["mass", "centre of mass", "flange to sensor"]
-    sigma_kg = float(figures["mass"]["sigma"].removeprefix("± ").removesuffix(" (1 sigma)"))
-    assert sigma_kg == pytest.approx(outcome.result.sigma["mass_kg"], rel=0.05)
-    assert float(figures["mass"]["value"]) == pytest.approx(outcome.result.mass_kg, abs=sigma_kg)
-    assert len(figures["centre of mass"]["value"].split(", ")) == 3
-    assert (parts["result/next"]["head"], parts["result/next"]["lines"]) == ("Next", ["ftdrive live"])
 
 
 def test_a_verification_ends_with_its_verdict(lab: Lab, page: Page) -> None:

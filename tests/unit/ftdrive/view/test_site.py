@@ -3,7 +3,6 @@
 import json
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
@@ -130,12 +129,3 @@ def test_controls_are_not_used_from_another_site(page: Page) -> None:
     viewer = Viewer(page)
     for headers in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "same-site"}, {"Host": "evil.example"}):
         assert viewer.do("stop", **headers) == 403
-
-
-def test_a_page_that_is_not_drawn_any_more_is_stale(page: Page) -> None:
-    assert page.stale_s == 0
-    page.beat()
-    time.sleep(0.01)
-    assert 0 < page.stale_s < 30
-    beat = next(data for event, data in Viewer(page).follow() if event == "beat")
-    assert isinstance(beat, float | int)
