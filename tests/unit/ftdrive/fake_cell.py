@@ -202,7 +202,6 @@ class FakeSensor(ForceTorqueSensor):
         self.collecting: Callable[[], object] = lambda: None
         self._newest = np.zeros(6)
         self._seq = 0
-        self.events: tuple[tuple[int, str], ...] = ()
 
     def open(self) -> None:
         if self.heals:
@@ -250,7 +249,7 @@ class FakeSensor(ForceTorqueSensor):
             raise self.failure
 
     def health(self) -> Health:
-        return Health(self._seq, 0, 0, 1000.0, 0.001, events=self.events)
+        return Health(self._seq, 0, 0, 1000.0, 0.001)
 
 
 @dataclass
@@ -464,20 +463,6 @@ class Lab:
 
     def holds(self) -> list[tuple[str, ...]]:
         return [question.answers for question in self.operator.asked if "resume" in question.answers]
-
-    def press(self, *presses: tuple[Key, type[Event], int]) -> None:
-        """Press each key once, when an event of its kind is shown for its stop."""
-        left = list(presses)
-
-        def on_event(event: Event) -> None:
-            for one in left:
-                key, kind, stop = one
-                if isinstance(event, kind) and getattr(event, "stop", None) == stop:
-                    left.remove(one)
-                    self.operator.keys.append(key)
-                    return
-
-        self.operator.on_event = on_event
 
     def push_on_the_way(self, *moves: int) -> None:
         """Let something be in the way of these moves, and be gone when a person is asked."""

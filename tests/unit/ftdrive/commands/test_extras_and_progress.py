@@ -9,16 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftdrive import cli
-from ftdrive.terminal.console import messages, working
-
-
-def test_a_terminal_sees_at_what_a_command_works(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = list[Any]()
-    monkeypatch.setenv("TTY_COMPATIBLE", "1")
-    monkeypatch.setattr(messages, "status", _Status.of(seen))
-    with working("Recording") as show:
-        show("3.0 s, 1500 samples, gaps: 0")
-    assert seen == ["Recording …", "3.0 s, 1500 samples, gaps: 0 …"]
+from ftdrive.terminal.console import messages
 
 
 def test_commands_that_take_long_say_at_what_they_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

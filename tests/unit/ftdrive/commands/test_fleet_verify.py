@@ -136,11 +136,6 @@ def test_only_yes_starts_a_session(no: str | Exception, lab: Lab) -> None:
     assert out == ["A: skipped", "B: passed", "C: skipped"]
 
 
-def test_only_cells_that_are_due(lab: Lab) -> None:
-    lab.run("--due", answers=["", ""])
-    assert lab.asked == ["B", "C"]
-
-
 def test_a_tool_that_was_never_calibrated_is_due_and_not_asked_about(lab: Lab) -> None:
     lab.put(lab.cell("A", tool="drill"))
     code, out, err = lab.run("--due", answers=["", ""])

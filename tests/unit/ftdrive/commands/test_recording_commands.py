@@ -200,34 +200,6 @@ def test_what_cannot_be_done_is_refused_before_any_work(run_record: Run, options
     assert words in " ".join(err.split())
 
 
-def test_a_conversion_is_complete_and_says_what_was_cut(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    recorder = Recorder([Path("a.csv")], info(), {})
-    recorder.add(block(1500), [])
-    recorder.add(block(100, 1500), [])
-    recorder.add(block(100, 1600), [])
-    recorder.add(block(100, 1700), [])
-    Path("b.csv.partial").write_bytes(Path("a.csv.partial").read_bytes()[:-30])
-    recorder.end()
-    assert cli.run(["convert", "a.csv", "b.mcap", "--json"]) == 0
-    out, err = capsys.readouterr()
-    answer = json.loads(out)
-    assert (answer["samples"], answer["gaps"], answer["complete"]) == (1800, 0, True)
-    assert answer["duration_s"] == pytest.approx(load_recording(Path("b.mcap")).duration_s)
-    assert load_recording(Path("b.mcap")).rows.tobytes() == load_recording(Path("a.csv")).rows.tobytes()
-    assert cli.run(["convert", "b.csv.partial", "b.parquet", "--json"]) == 0
-    out, err = capsys.readouterr()
-    assert (json.loads(out)["samples"], json.loads(out)["complete"]) == (1500, False)
-    assert "incomplete" in err
-    assert cli.run(["convert", "a.csv", "b.mcap"]) == 2
-    Path("d.csv").write_text("t,fx\n")
-    assert cli.run(["convert", "d.csv", "e.mcap"]) == 6
-    assert "another program" in capsys.readouterr().err
-    assert not Path("e.mcap.partial").exists()
-
-
 @pytest.fixture(scope="module")
 def three_seconds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recorded") / "a.mcap"

@@ -64,13 +64,6 @@ def press_and_release(mode: str = "robot emergency stop") -> Action:
     return do
 
 
-def fail(error: BaseException) -> Action:
-    def do(_: Lab) -> None:
-        raise error
-
-    return do
-
-
 def both(*actions: Action) -> Action:
     return lambda lab: [action(lab) for action in actions]
 

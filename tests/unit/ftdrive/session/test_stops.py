@@ -19,7 +19,6 @@ from tests.unit.ftdrive.session.scenarios import (
     both,
     cases,
     end_guards,
-    fail,
     lose_sensor,
     press,
     push,
@@ -101,21 +100,9 @@ def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: La
     assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
 
 
-def leave(lab: Lab) -> None:
-    lab.operator.gone = LEFT
-    raise SupervisorGone(LEFT)
-
-
 LEFT = "the reader of standard output is gone"
 CONTACT = "unexpected contact"
 STOPS = {
-    "a protective stop that the driver reports names its usual causes too": Case(
-        {"move 4": both(status("protective stop"), fail(DeviceFault("the arm stopped: protective stop")))},
-        ends="wrong payload",
-        rows=(10,),
-        holds=((4, "protective stop"),),
-        taken=(1, 2, 3),
-    ),
     "a controller that does not hear the stop may end its move": Case(
         {"move 4": lose_controller},
         ends="silent",
@@ -136,16 +123,6 @@ STOPS = {
         taken=(1, 2),
         moves=3,
         noted={"not yet": 2},
-    ),
-    "resume with something still pushing is refused though the tool is unknown": Case(
-        {"move 3": push()},
-        ("resume", "quit"),
-        ends=CONTACT,
-        rows=(14, 14),
-        holds=((3, CONTACT),),
-        taken=(1, 2),
-        moves=3,
-        noted={"not yet": 1, f"not yet: {CONTACT}": 1},
     ),
     "what became wrong while the arm stood is found before it goes on": Case(
         {
@@ -204,9 +181,6 @@ STOPS = {
             ("back", ("back",), (14, 21), ((4, CONTACT), (4, "joint 1")), (1, 2, 3), 4),
         )
     },
-    "what is wrong already is seen before the arm moves": Case(
-        {"taken 2": status(program="paused")}, ends="paused", rows=(21,), holds=((2, "paused"),), taken=(1, 2), moves=2
-    ),
     "guards that ended on the way are missed at once": Case(
         {"move 3": end_guards},
         ("resume", "quit"),
@@ -224,13 +198,6 @@ STOPS = {
         rows=(27,),
         taken=(1, 2),
         moves=3,
-    ),
-    "a hold that the supervisor leaves ends with its first cause": Case(
-        {"move 4": push(), "asked resume:": leave},
-        ends=CONTACT,
-        rows=(14, 27),
-        holds=((4, CONTACT),),
-        taken=(1, 2, 3),
     ),
     "reduced mode that stays is confirmed before the arm goes on": Case(
         {"move 4": status("reduced")},

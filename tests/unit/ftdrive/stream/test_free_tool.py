@@ -102,32 +102,6 @@ def test_parts_and_contacts_do_not_reach_the_bias() -> None:
     assert 10 <= sum(event.kind == "contact" for event in program.events) <= 15
 
 
-def test_a_load_and_a_contact_are_events_with_their_time_and_size() -> None:
-    program = Program(3)
-    program.turn(20)
-    program.part_kg, begin_s = 0.9, program.t_s
-    program.turn(16)
-    (load,) = program.events
-    assert load.kind == "load-step"
-    assert load.t_host_ns * 1e-9 == pytest.approx(begin_s, abs=3.1 * WINDOW_S)
-    assert load.values["mass_kg"] == pytest.approx(0.9, abs=4 * load.values["mass_sigma_kg"])
-    assert load.values["mass_sigma_kg"] < 0.02
-    begin_s = program.t_s
-    program.hold(5, np.zeros(3), np.array([0.0, 3.0, -4.0, 4.0, 0.0, 0.0]))
-    program.turn(12)
-    contact = program.events[-1]
-    assert contact.kind == "contact"
-    assert contact.t_host_ns * 1e-9 == pytest.approx(begin_s, abs=3.1 * WINDOW_S)
-    assert contact.values["peak_N"] == pytest.approx(5.0, abs=0.6)
-    program.part_kg = 0.0
-    program.turn(16)
-    assert [event.kind for event in program.events] == ["load-step", "contact", "load-step"]
-    assert program.events[-1].values["mass_kg"] == pytest.approx(
-        -0.9, abs=4 * program.events[-1].values["mass_sigma_kg"]
-    )
-    assert max(program.off) < 3.5
-
-
 WINDOW = Window(
     t_s=0.0,
     residual=np.zeros(6),

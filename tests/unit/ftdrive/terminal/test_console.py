@@ -114,24 +114,6 @@ def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path, 
     assert in_a_sentence(own) == str(own)
 
 
-def test_80_columns_hold_whole_words_and_commands_that_a_shell_reads(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("os.get_terminal_size", lambda *_: os.terminal_size((80, 24)))
-    monkeypatch.setattr(messages, "soft_wrap", False)
-    monkeypatch.setenv("COLUMNS", "80")
-    command, why = "ftdrive live --calibration runs/2026-11-23T135517Z-with-a-long-name --simulate", "(why it helps)"
-    messages.print_next(command, f"{command}   {why}")
-    echo("words " * 30)
-    echo(f'{{"words": "{"x " * 60}"}}', fold=False)
-    out, err = capfd.readouterr()
-    *lines, data = out.splitlines()
-    assert len(data) > 120
-    assert max(map(len, [*lines, *err.splitlines()])) <= 80
-    assert set(" ".join(lines).split()) == {"words"}
-    assert " ".join(err.replace("\\\n", "").split()) == f"Next {command} {command} {why}"
-
-
 NAME = "\x1b]0;owned\x07 gripper\x9b2J \u202epilf\r0\udcff\ttab\nline\r\n"
 SHOWN = "\\x1b]0;owned\\x07 gripper\\x9b2J \\u202epilf\\r0\\udcff\ttab\nline\r\n"
 

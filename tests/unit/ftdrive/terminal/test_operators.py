@@ -25,7 +25,7 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
-from ftdrive.terminal.operators import JsonOperator, PlainOperator, match_answer, not_an_answer
+from ftdrive.terminal.operators import JsonOperator, PlainOperator, match_answer
 from tests.unit.ftdrive.terminal.test_screen import estimated, pose
 
 FREE = Question("Is the tool free?", assumed="yes")
@@ -163,15 +163,3 @@ def test_a_terminal_that_cannot_discard_early_answers_gives_none(monkeypatch: py
         PlainOperator(stdin=typed, stderr=io.StringIO()).ask(Question("Type MOVE", ("MOVE",)))
     assert typed.tell() == 0
     assert exit_code(error.value) == 2
-
-
-@pytest.mark.parametrize(
-    ("answers", "typed", "advice"),
-    [
-        (("resume", "skip", "back", "quit"), "s", "type skip in full"),
-        (("MOVE",), "move", "type it in capital letters"),
-        (("", "s", "r", "q"), "x", "type 's', 'r', 'q' or Enter"),
-    ],
-)
-def test_what_is_no_answer_is_said_with_what_would_be(answers: tuple[str, ...], typed: str, advice: str) -> None:
-    assert advice in not_an_answer(Question("?", answers), typed)

@@ -38,8 +38,3 @@ def test_a_row_is_one_line_where_it_fits_and_in_a_pipe(columns: int | None, prin
 def test_no_word_is_ever_broken(columns: int, printed: Printed) -> None:
     words = {word for row in ROWS for text in row for word in text.split()}
     assert words <= {word for line in printed(columns)[1:] for word in line.split()}
-
-
-def test_the_last_columns_begin_a_line_where_the_terminal_is_too_narrow(printed: Printed) -> None:
-    _, *lines = (line.rstrip() for line in printed(18))
-    assert lines == ["  due", "press-4  a gripper", "         with a", "         long name", "  now", "b", "  in 5 d"]

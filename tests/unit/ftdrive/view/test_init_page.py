@@ -87,17 +87,6 @@ def test_no_answer_ends_the_form(form: Form) -> None:
     assert json.loads(form.draft.read_text())["texts"]["tool.name"] == ["tool"]
 
 
-def test_what_is_wrong_is_red_below_its_field(form: Form) -> None:
-    form.enter("sensor.height_mm", "high")
-    form.enter(f"{TOOL} 1", f"0:60:90:{HUGE}:0")
-    form.wait(lambda: "1e+308 mm off the" in str(form.parts()) or "Correct" in str(form.parts()["form/words"]))
-    height = form.controls()["sensor.height_mm"]
-    assert (height["tone"], "'high', which is not a number" in height["words"]) == ("bad", True)
-    form.enter("sensor.height_mm", "33")
-    form.wait(lambda: "off the flange axis" in str(form.parts()["form/words"]))
-    assert form.controls()["write"]["disabled"]
-
-
 @pytest.mark.parametrize("name", IMPOSSIBLE_NAMES)
 def test_an_address_that_cannot_exist_is_named(form: Form, name: str) -> None:
     for key in (ROBOT, SENSOR):

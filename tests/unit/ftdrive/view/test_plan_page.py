@@ -82,18 +82,6 @@ def test_the_tour_goes_through_every_pose_in_its_time_and_back(plan: Plan) -> No
     assert np.abs(np.diff(tour.q_rad, axis=0)).max() < np.radians(7)
 
 
-def test_the_tour_begins_where_the_arm_stands(plan: Plan) -> None:
-    way = plan.nodes_rad[0] + np.radians([[-20.0, 0, 0, 10, 0, 0], [0.0, 0, 0, 10, 0, 0], [0.0] * 6])
-    tour, alone = PlanTimeline(plan, way), PlanTimeline(plan)
-    approach_s = tour.begins_s[0]
-    np.testing.assert_allclose(tour.at(0.0), way[0])
-    assert approach_s > 1
-    assert tour.end_s == pytest.approx(approach_s + alone.end_s)
-    np.testing.assert_allclose(tour.at(approach_s + 3.0), alone.at(3.0))
-    assert (tour.move(approach_s - 0.1), tour.move(approach_s)) == (-1, 0)
-    assert "From the present posture" in describe_move(plan, tour.move(0.0))[0]
-
-
 def test_viewers_step_from_pose_to_pose(shown: Shown, page: Page, plan: Plan) -> None:
     for name, at in (("next", 1), ("next", 2), ("previous", 1), ("previous", 0), ("previous", 5), ("next", 0)):
         page.act("viewer 0", name, None)

@@ -1,7 +1,6 @@
 """The page of a session as an operator: what it passes on, who stops, what it shows, and how it ends."""
 
 import json
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -318,34 +317,6 @@ def test_a_sweep_is_one_motion(lab: Lab, page: Page, monkeypatch: pytest.MonkeyP
     assert along["controls"][0]["text"] == f"{along['controls'][0]['value']:.0f} of {along['controls'][0]['max']:.0f} s"
     assert len(looks[0]["scene/path"]["points"]) > 100
     assert lab.operator.states()[-1] is State.STOP
-
-
-def test_a_session_whose_page_cannot_be_drawn_goes_on_and_says_so_once(
-    lab: Lab, page: Page, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    drawers: list[threading.Thread] = []
-
-    def fail(_: SessionPage) -> None:
-        drawers.append(threading.current_thread())
-        raise RuntimeError("no memory")
-
-    monkeypatch.setattr(SessionPage, "draw", fail)
-    page.viewers = 1
-    threads: set[threading.Thread] = set()
-    watched = Watched(page, lab.operator)
-    lab.operator.on_event = lambda event: threads.add(threading.current_thread()) if is_failure(event) else None
-    with caplog.at_level(logging.INFO), watched:
-        wait_until(lambda: bool(drawers) and not drawers[0].is_alive())
-        run_with(lab, watched)
-        watched.show(Noted(words="a note"))
-    notes = list(filter(is_failure, lab.operator.of(Noted)))
-    assert [note.words for note in notes] == [
-        "The page cannot be updated: RuntimeError('no memory'). The session continues. Stop on the page still works."
-    ]
-    assert notes[0].warning
-    assert threads == {threading.current_thread()}
-    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
-    assert caplog.text == ""  # a traceback would stand in the middle of the screen
 
 
 def is_failure(event: object) -> bool:
