@@ -6,6 +6,7 @@ import pytest
 
 from ftdrive.commands.calibrate import refuse_contradictions
 from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.planning.planner import USUAL_POSTURE_RAD
 from ftdrive.runs.load import Load
 from ftdrive.session.events import Noted
 from tests.unit.ftdrive.fake_cell import Lab
@@ -46,6 +47,7 @@ def test_a_gripped_load_is_asked_for(lab: Lab) -> None:
 @pytest.mark.slow
 def test_a_load_is_hung_when_the_arm_stands_at_the_first_pose(lab: Lab) -> None:
     weigh(lab, 1.0, 3.0)
+    lab.arm.q = USUAL_POSTURE_RAD
     lab.calibrate(load=HUNG)
     asked = [question.text for question in lab.operator.asked]
     assert "the weight off" in asked[0]
