@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from ftcalib.errors import BadDataset
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
-from ftdrive.cell.emulated import REAL_PACE, Station
+from ftdrive.cell.emulated import Station
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError
 from ftdrive.runs.load import Load
@@ -84,15 +84,6 @@ def test_options_that_exclude_one_another_are_both_named(
     assert cells == []
 
 
-@pytest.mark.parametrize("sets", ["", "A+Z", "A+A"])
-def test_unknown_and_repeated_sets_are_refused_before_the_session(sets: str, cells: list[Any]) -> None:
-    Path("ftdrive.toml").write_text(CELL)
-    error = call("--set", sets)
-    assert isinstance(error, ConfigError)
-    assert "choose A, B" in str(error) or "contains a set twice" in str(error)
-    assert cells == []
-
-
 def test_a_tour_by_hand_has_not_the_orientations_of_srom(cells: list[Any]) -> None:
     Path("ftdrive.toml").write_text(CELL)
     for method in ("srom", "mixed"):
@@ -149,18 +140,6 @@ def test_a_resumed_run_takes_the_files_as_they_are_now(begin: Begin, cells: list
     assert options.resume == Path(run)
 
 
-def test_a_resumed_run_keeps_the_tool_it_was_given(begin: Begin, cells: list[Any]) -> None:
-    Path("ftdrive.toml").write_text(CELL)
-    run = begin("--tool", "0:60:90")
-    assert isinstance(call("--resume", run), Opened)
-    assert cells.pop()[0].tool.cylinders_mm == ((0, 60, 90),)
-    assert isinstance(call("--resume", run, "--tool", "0:70:90"), Opened)
-    assert cells.pop()[0].tool.cylinders_mm == ((0, 70, 90),)
-    Path("ftdrive.toml").unlink()
-    assert isinstance(call("--resume", run, "--tool", "0:70:90"), Opened)
-    assert cells.pop()[0].tool.cylinders_mm == ((0, 70, 90),)
-
-
 @pytest.fixture
 def stations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Sequence[str]]]:
     """Which emulated cells are started, by sensor and options; none is."""
@@ -195,13 +174,6 @@ def test_an_emulated_run_goes_on_in_the_same_cell(cells: list[Any], stations: li
     assert isinstance(call("--resume", str(run.folder), "--robot", "10.0.0.9"), Opened)
     assert stations == []
     assert cells.pop()[1].real
-
-
-@pytest.mark.parametrize(("place", "pace"), [(("--at", "tip=0,0,200"), REAL_PACE), (("--gripped",), ())])
-@pytest.mark.usefixtures("cells")
-def test_a_load_on_a_string_needs_the_pace_of_a_real_arm(place: Any, pace: Any, stations: list[Any]) -> None:
-    call("--simulate", "--load", "2.0", *place)
-    assert stations.pop()[1] == pace
 
 
 @pytest.mark.parametrize(

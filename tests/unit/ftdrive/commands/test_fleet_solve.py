@@ -71,19 +71,3 @@ def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(
     assert (changed["run"], changed["parameter"]) == (str(worse), "force_bias_N.z")
     assert changed["sigmas"] < -3
     assert found["other_verdict"] == [{"run": str(worse), "before": "usable", "now": "good", "finding": None}]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (["--workers", "2", "--cluster", "dask://host:1"], 2, "--workers and --cluster are mutually exclusive"),
-        (["--since", "soon"], 2, "--since is 'soon': give an age such as 90d or 12h, or a date such as 2026-08-31"),
-        (["--cluster", "host"], 2, "--cluster is 'host': give the address of a Dask scheduler"),
-        (["--store", "nowhere"], 2, "is not a database address"),
-        (["--workers", "0"], 2, "0 is not in the range"),
-    ],
-)
-def test_a_mistake_is_one_sentence(run: Callable[..., Ran], arguments: list[str], code: int, words: str) -> None:
-    ended, out, err = run(*arguments)
-    assert (ended, out) == (code, "")
-    assert words in err

@@ -177,12 +177,3 @@ def test_a_variable_that_would_describe_every_cell_is_refused(
     code, out, err = lab.run()
     assert (code, out, lab.asked) == (2, [], [])
     assert f"{name} is set" in err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [(("A", "--due"), "CELL and --due are mutually"), (("D",), "there is no cell 'D': the cells are A, B, C")],
-)
-def test_a_wrong_choice_is_refused(arguments: tuple[str, ...], words: str, lab: Lab) -> None:
-    code, out, err = lab.run(*arguments)
-    assert (code, out, words in err) == (2, [], True)

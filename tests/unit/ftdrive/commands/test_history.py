@@ -3,8 +3,6 @@
 import json
 import sqlite3
 from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,14 +12,13 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult
-from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, user_folder
-from ftdrive.commands.options import CellOptions, SourceOptions
+from ftdrive.cell.config import user_folder
 from ftdrive.runs.run import Run
 from ftdrive.runs.weighings import FOLDER, append_weighings
 from ftdrive.store.database import SCHEMA, default_file
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.store.run_folders import new_run, result, verified
-from tests.unit.ftdrive.stream.simulated import calibrated, info
+from tests.unit.ftdrive.stream.simulated import calibrated
 
 Ran = tuple[int, str, str]
 
@@ -211,21 +208,3 @@ def test_options_that_name_another_cell_or_calibration_are_refused(
 ) -> None:
     code, _, err = run(*command, *more)
     assert (code, words in err) == (2, True)
-
-
-@pytest.mark.parametrize("emulated", [False, True])
-def test_weighings_are_kept_with_a_calibration_of_a_file(
-    emulated: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    calibration = result(1, station={} if emulated else None)
-    config = CellConfig(RobotConfig(host="10.0.0.7"), SensorConfig("ati-can://can0"))
-    stream: Any = SimpleNamespace(info=replace(info(calibration), emulated=emulated), cell=config)
-    source = SourceOptions(None, None, False, CellOptions(), emulated)
-    with ExitStack() as stack:
-        if emulated:
-            source.open_log(stream, stack, print)({"refused": "cable"})
-        source._replace(path=tmp_path).open_log(stream, stack, print)({"refused": "cable"})
-    (day,) = Store().weighings(9)
-    assert (day.tool, day.calibration_id, day.robot_host) == ("gripper", calibration.id, "10.0.0.7")
-    assert (day.emulated, day.refusals["cable"], day.last_utc) == (emulated, 1, None)

@@ -7,14 +7,13 @@ from collections.abc import Iterable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from ftdrive.checks.check import Check
 from ftdrive.commands import live
 from ftdrive.stream.feed import Feed
 from ftdrive.stream.samples import Links, WrenchFrame
@@ -80,44 +79,12 @@ def test_axes_and_point_are_chosen_separately(arguments: list[str]) -> None:
     np.testing.assert_allclose(as_measured["compensated"]["force_N"], sensor["raw"]["force_N"], atol=1e-9)
 
 
-class Quiet:
-    """A terminal that echoes except inside."""
-
-    used: ClassVar[list[str]] = []
-
-    def __init__(self, fd: int) -> None:
-        assert fd == 0
-
-    usable = staticmethod(lambda _: True)
-
-    def __enter__(self) -> None:
-        self.used.append("echo off")
-
-    def __exit__(self, *_: object) -> None:
-        self.used.append("as before")
-
-
 def shown_table(monkeypatch: pytest.MonkeyPatch, views: Iterable[View]) -> str:
     console = Console(width=80, file=io.StringIO(), color_system=None, force_terminal=False)
     monkeypatch.setattr(live_panels, "answer", console)
     live_panels.show_table(views)
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
-
-
-def test_the_table_ends_with_the_recording_and_breaks_no_word(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_panels, "Keyboard", Quiet)
-    checks = [Check("robot.payload", "ok", "robot 1.44 kg")]
-    shown = shown_table(monkeypatch, StreamSummary(Feed(pushed()), checks).views())
-    assert shown.rstrip().endswith("The recording has ended.")
-    assert "Ctrl-C" not in shown
-    lines = shown.splitlines()
-    assert max(map(len, lines)) <= 80
-    (force,) = [line for line in lines if line.startswith(" Fx")]
-    assert re.match(r" Fx +\+1\.\d+ +0\.\d+ ", force)
-    assert any("▲ CONTACT" in line for line in lines)
-    assert "robot 1.44 kg" in lines[-2]
-    assert Quiet.used == ["echo off", "as before"]
 
 
 class Interrupted(RecordingSource):

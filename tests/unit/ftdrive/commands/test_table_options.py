@@ -8,10 +8,9 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from ftdrive import cli
 from ftdrive.runs.source import _forward
 from tests.ros2.seven_joints import URDF
-from tests.unit.ftdrive.tables.test_layouts import POSES, columns, quaternion, t, text, wrench
+from tests.unit.ftdrive.tables.test_layouts import POSES, quaternion, t, text, wrench
 
 Solved = Callable[..., tuple[int, str, str]]
 PLAIN = t(POSES) | wrench(POSES) | quaternion(POSES)
@@ -73,16 +72,6 @@ def test_a_unit_may_have_a_size(solved: Solved) -> None:
     )
 
 
-def test_what_was_recognised_is_printed_and_kept(solved: Solved) -> None:
-    code, out, err = solved(
-        t(POSES, "time_ms", 1e-3) | wrench(POSES) | columns("A B C", POSES.R.as_euler("ZYX", degrees=True))
-    )
-    assert code == 0
-    assert err == "poses.csv: columns of KUKA; angles in degrees"
-    assert json.loads(out)["provenance"]["table"] == "columns of KUKA; angles in degrees"
-    assert "table" not in json.loads(solved(PLAIN)[1])["provenance"]
-
-
 def test_the_sign_reverses_what_is_read(solved: Solved) -> None:
     reaction = PLAIN | {name: -values for name, values in wrench(POSES).items()}
     near(parameters(solved(reaction, "--sign", "-1")), parameters(solved(PLAIN)))
@@ -120,11 +109,3 @@ def test_an_option_that_cannot_be_used_is_one_sentence(options: list[str], words
     assert out == ""
     assert words in err
     assert err.count("error:") + err.count("Error:") == 1
-
-
-def test_options_of_a_table_do_not_go_with_other_data(solved: Solved) -> None:
-    near(parameters(solved(PLAIN)), parameters(solved(PLAIN, "--rate", "1")))  # poses have their times in any case
-    from ftdrive import read_dataset
-
-    read_dataset("poses.csv").save("dataset.json")
-    assert cli.run(["solve", "dataset.json", "--sign", "-1"]) == 2

@@ -11,7 +11,6 @@ from click.testing import CliRunner
 
 from ftdrive.cli import cli
 from ftdrive.commands.options import SourceOptions
-from ftdrive.errors import ConfigError
 from ftdrive.stream.weighing import CannotWeigh, ScaleState
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.terminal.fake_stream import INFO
@@ -68,11 +67,6 @@ def weighed(scale: Scale, monkeypatch: pytest.MonkeyPatch, *options: str) -> tup
     return opened, outcome.stdout
 
 
-def test_each_new_weight_and_fault_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    scale = Scale((MOVING, False), (EMPTY, True), (EMPTY, False), (CABLE, True), (ONE, True))
-    assert [line.split()[0] for line in weighed(scale, monkeypatch)[1].splitlines()] == ["nothing:", "not", "0.8123"]
-
-
 def test_once_gives_up_after_ten_seconds_unless_it_waits_for_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
     late = [(MOVING, False)] * 10
     assert weighed(Scale(*late[:-1], (ONE, True)), monkeypatch, "--once")[1]
@@ -108,10 +102,3 @@ def test_a_zero_comes_first_and_then_a_part_is_waited_for(monkeypatch: pytest.Mo
     assert out.startswith("0.3000 ")
     opened, out = weighed(Scale((EMPTY, True)), monkeypatch, "--once")
     assert (opened["joins"], out.startswith("nothing: ")) == (False, True)
-
-
-@pytest.mark.parametrize("option", [("--zero",), ("--poses", "2")])
-def test_weighing_in_motion_needs_neither_zero_nor_poses(option: tuple[str, ...]) -> None:
-    outcome = CliRunner().invoke(cli, ["weigh", "--simulate", "--moving", *option])
-    assert isinstance(outcome.exception, ConfigError)
-    assert "leave out --zero and --poses" in str(outcome.exception)

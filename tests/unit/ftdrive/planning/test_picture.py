@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
 
 from ftdrive.planning.drawing import draw_plan
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
@@ -33,36 +32,32 @@ def plan() -> Plan:
 
 def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     figures = pytest.importorskip("matplotlib.figure")
-    save, saved = figures.Figure.savefig, list[Any]()
-
-    def keep(figure: Any, *arguments: object, **options: object) -> None:
-        if not saved:  # one file is enough
-            save(figure, *arguments, **options)
-        saved.append(figure)
-
-    monkeypatch.setattr(figures.Figure, "savefig", keep)
+    saved = list[Any]()
+    monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: saved.append(figure))
     stands = np.array(plan.steps[0].q_rad) + np.radians([20, 0, 0, 0, 0, 0])
-    cases: list[tuple[Certifier, ArrayLike]] = [
-        (certifier_of(), ()),
-        (certifier_of((TUBE, LUMP)), ()),
-        (certifier_of(scene=Scene((BASE_PLANE, WALL), (BOX,))), ()),
-        (certifier_of(), np.array([stands, plan.steps[0].q_rad])),
-        (certifier_of(scene=Scene((BASE_PLANE, SLANTING))), ()),
-    ]
-    for i, (certifier, way_rad) in enumerate(cases):
-        draw_plan(plan, certifier, tmp_path / f"{i}.png", way_rad)
+    around = Scene((BASE_PLANE, WALL, SLANTING), (BOX,))
+    draw_plan(plan, certifier_of(), tmp_path / "bare.png", ())
+    draw_plan(plan, certifier_of((TUBE, LUMP), around), tmp_path / "all.png", [stands, plan.steps[0].q_rad])
     areas = [[len(axes.patches) for axes in figure.axes] for figure in saved]
+    assert np.subtract(areas[1], areas[0]).tolist() == [
+        7,
+        8,
+        8,
+    ]  # the lump at 6 poses, box, and what is behind the wall
     lines = [[len(axes.lines) for axes in figure.axes] for figure in saved]
-    assert np.subtract(areas[1], areas[0]).tolist() == [6, 6, 6]  # the lump at each pose
-    assert np.subtract(areas[2], areas[0]).tolist() == [1, 2, 2]  # the box, and the wall from its edge
-    assert np.subtract(lines[3], lines[0]).tolist() == [1, 1, 1]
-    assert [figure.axes[2].get_xlim()[1] > 0.8 for figure in saved] == [False, False, True, False, False]  # the wall
+    assert np.subtract(lines[1], lines[0]).tolist() == [1, 2, 2]  # the way, and the edge of the wall
+    assert [figure.axes[2].get_xlim()[1] > 0.8 for figure in saved] == [False, True]  # the wall
     titles = [figure.get_suptitle() for figure in saved]
-    assert ["slanting planes (1)" in title for title in titles] == [False, False, False, False, True]
-    assert ["green" in title for title in titles] == [False, False, False, True, False]
+    for words in ("slanting planes (1)", "green"):
+        assert [words in title for title in titles] == [False, True]
     first, second, *others = plan.steps
     moving = replace(plan, steps=(first, replace(second, q_rad=(0.5, *second.q_rad[1:])), *others))
     draw_plan(moving, certifier_of(), tmp_path / "moving.png", ())
-    assert ("WHOLE ARM moves" in saved[-1].get_suptitle()) > ("WHOLE ARM" in titles[0])
+    assert ("WHOLE ARM moves" in saved[2].get_suptitle()) > ("WHOLE ARM" in titles[0])
+
+
+def test_a_picture_is_never_overwritten(plan: Plan, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib.figure")
+    (path := tmp_path / "plan.png").touch()
     with pytest.raises(FileExistsError, match="never overwritten"):
-        draw_plan(plan, certifier_of(), tmp_path / "0.png")
+        draw_plan(plan, certifier_of(), path, ())

@@ -1,6 +1,5 @@
 """The service for a program: which registers it writes, and how it answers."""
 
-import threading
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -205,21 +204,3 @@ def test_a_wrench_without_new_samples_is_stale_and_a_lost_controller_is_called_a
     wait_until(lambda: cell.said[-1] == "The controller answers again.")
     cell.service.end()
     assert cell.registers.written[-1]["state"] == 0
-
-
-def test_ctrl_c_ends_the_service_while_it_starts_and_says_nothing_of_a_controller_that_has_ended(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    class Interrupted(threading.Thread):
-        def start(self) -> None:
-            super().start()
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr("ftdrive.servers.program.threading.Thread", Interrupted)
-    cell = Cell((POSE, NOTHING))
-    cell.registers.broken = True
-    threads = threading.active_count()
-    with pytest.raises(KeyboardInterrupt):
-        cell.service.run()
-    assert threading.active_count() == threads
-    assert cell.said == []

@@ -373,12 +373,6 @@ def test_a_pose_that_is_never_quiet_is_kept_and_marked() -> None:
     assert "press r to take" in outcome.person.words()
 
 
-def test_a_mean_that_changes_is_seen_at_the_first_pose_too() -> None:
-    outcome = Outcome([Dwell(UP, 30.0, wrench=lambda t: np.outer(np.minimum(t, 5.0), np.full(6, 0.2)))])
-    assert "its mean still changes" in outcome.person.words()
-    assert outcome.kept[-1].steady
-
-
 @pytest.mark.parametrize(
     ("residual", "asked"), [((40.0, 3.2), True), ((40.0, 0.1), False), ((3.0, 3.2), False), (None, False)]
 )

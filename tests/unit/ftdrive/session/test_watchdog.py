@@ -167,16 +167,6 @@ def test_an_arm_that_reports_nothing_for_a_second_was_out_of_sight(gone_s: float
         assert watcher.unseen == unseen
 
 
-def test_an_emergency_stop_is_seen_within_a_twentieth_of_a_second_while_the_arm_stands() -> None:
-    cell = Cell()
-    with cell.watcher as watcher:
-        cell.clock.advance(1.0)
-        cell.arm.set_status(fault=DeviceFault("a stop"), safety_mode="robot emergency stop")
-        cell.clock.advance(0.051)
-        cell.arm.set_status()
-        assert watcher.safety_stop is not None
-
-
 @pytest.mark.parametrize("stop", [0, 3])
 def test_nothing_moves_without_a_watchdog(stop: int, lab: Lab) -> None:
     def on_event(event: Event) -> None:

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ftcalib.model import Array
-from ftdrive.stream.contact import Contact, ContactTest, ContactTracker, Inertia
+from ftdrive.stream.contact import ContactTest, ContactTracker, Inertia
 from ftdrive.stream.noise import SensorNoise
 from tests.unit.ftdrive.stream.simulated import KnownNoise, calibrated, paired
 
@@ -97,17 +97,6 @@ def test_the_distance_has_all_that_is_not_known_in_its_covariance(state: int, in
     np.testing.assert_allclose(test.uncertainty, uncertainty + np.diag(BEYOND))
     restarted = judged(test, np.zeros((0, 6)), np.zeros((0, 6)), state, felt, inertia)
     assert [len(one) for one in restarted] == [0, 0, 0]
-
-
-def test_a_contact_has_a_line_of_force() -> None:
-    force_N, at_m = np.array([3.0, 0.0, -4.0]), np.array([0.1, 0.02, 0.05])
-    contact = Contact(2 * 10**9, 5 * 10**9, 5.0, np.r_[force_N, np.cross(at_m, force_N)])
-    assert (contact.t_s, contact.duration_s) == (2.0, 3.0)
-    np.testing.assert_allclose(contact.direction, [0.6, 0.0, -0.8])
-    np.testing.assert_allclose(contact.line_m, at_m - (at_m @ force_N) * force_N / 25.0)
-    torque = Contact(0, 1, 0.0, np.array([0.0, 0, 0, 0, 0, 1.0]))
-    assert not torque.direction.any()
-    assert not torque.line_m.any()
 
 
 @pytest.mark.parametrize(("soon", "begin", "block"), [(False, 40, 7), (True, 20, 1000)])

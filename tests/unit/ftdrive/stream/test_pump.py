@@ -99,15 +99,6 @@ def test_a_sink_that_fails_is_ended_and_said_and_the_others_go_on() -> None:
     assert goes_on.got == "....-"
 
 
-@pytest.mark.parametrize("others", [0, 1])
-def test_the_last_sink_or_a_recording_that_fails_ends_the_loop(others: int) -> None:
-    source = Source("abcd")
-    first, *rest = [(Recorder if others else Output)(source, fails=FULL), *(Output(source) for _ in range(others))]
-    with pytest.raises(OSError, match="No space left"):
-        run(source, first, *rest)
-    assert [sink.calls for sink in (first, *rest)] == [["begin", "end"]] * (1 + others)
-
-
 def test_a_slow_sink_misses_samples_and_no_event_while_a_recorder_and_others_get_all() -> None:
     quick = Output(source := Source("a" * 100))
     slow, recorder = Output(source, slow_s=0.3), Recorder(source, slow_s=0.3)

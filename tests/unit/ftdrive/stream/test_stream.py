@@ -1,6 +1,5 @@
 """The stream of a cell: what it opens and refuses, gaps and silence, recovery, and what it reports."""
 
-import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult
-from ftcalib.display import MOST_LINES
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.errors import ConfigError
 from ftdrive.library import open_stream
@@ -156,19 +154,6 @@ def test_every_sample_arrives_once_with_its_pose(cell: Cell) -> None:
     assert stream.info.sensor_rate_Hz == pytest.approx(1000, rel=0.01)
     assert stream.info.arm_rate_Hz == pytest.approx(500, rel=0.01)
     assert [event.kind for event in stream.take_events()] == []
-
-
-def test_a_stream_is_shown_before_it_is_open_read_and_closed(cell: Cell) -> None:
-    stream = cell.stream()
-    assert "not open" in repr(stream)
-    stream.open()
-    assert "no sample was read yet" in repr(stream)
-    stream.read()
-    assert re.search(r"force now x, y, z +-?0\.\d\d, -?0\.\d\d, -?0\.\d\d N in sensor axes", repr(stream))
-    assert len(repr(stream).splitlines()) <= MOST_LINES
-    assert "<table>" in stream._repr_html_()
-    stream.close()
-    stream.close()
 
 
 @pytest.mark.parametrize("device", ["sensor", "arm"])

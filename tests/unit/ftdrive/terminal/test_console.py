@@ -67,21 +67,6 @@ def test_what_is_longer_than_the_terminal_goes_on_under_its_first_word(width: in
     assert indented("head: ", words, Console(width=width, soft_wrap=True)).plain == f"head: {words}"  # a file
 
 
-@pytest.mark.parametrize("before", [0, 7, 14])
-def test_a_command_in_backticks_stays_whole(before: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((40, 24)))
-    monkeypatch.setattr(sys.stderr, "fileno", lambda: 2, raising=False)
-    words = f"{'x' * before} install it by `uv sync --extra viz` or `pip install x`, then start again"
-    for shown in (
-        in_whole_words(words, sys.stderr),
-        indented(" ! ", words, Console(width=40, file=io.StringIO(), color_system=None)).plain,
-    ):
-        assert max(map(len, shown.splitlines())) <= 40
-        assert "`uv sync --extra viz`" in shown
-        assert "`pip install x`," in shown
-        assert " ".join(shown.removeprefix(" ! ").split()) == " ".join(words.split())
-
-
 def test_help_breaks_no_address_and_cuts_no_sentence() -> None:
     assert {"ati-can://can0?bitrate=250000,", "bota:///dev/ttyUSB0"} <= set(run("record", "--help").stdout.split())
     assert "or play them to the driver" in run("transcript", "--help").stdout

@@ -7,7 +7,7 @@ import pytest
 
 from ftdrive.runs.calibration import FOREIGN
 from ftdrive.stream.feed import FeedNote
-from ftdrive.stream.samples import Stages, WrenchFrame
+from ftdrive.stream.samples import WrenchFrame
 from ftdrive.terminal import live_panels
 from ftdrive.terminal.lines import GOOD, WARNING, Line
 from ftdrive.terminal.live_panels import other_wrench_lines
@@ -73,21 +73,6 @@ def test_the_wrench_is_shown_with_fewer_stages_and_in_other_frames(view: View) -
     np.testing.assert_allclose(found["base @ tcp"][:3], R_BASE_FLANGE @ R_flange_sensor @ push[:3], atol=0.0051)
     silent = [text(line) for line in other_wrench_lines(replace(view, reading=reading, silent="the arm"))]
     assert all(line.count("--.--") == 6 for line in silent[1:])
-
-
-@pytest.mark.parametrize(
-    ("stages", "words"),
-    [
-        (Stages(), "contact wrench"),
-        (Stages(gravity=False), "weight included"),
-        (Stages(bias=False), "bias included"),
-        (Stages(bias=False, gravity=False), "as measured"),
-    ],
-)
-def test_what_is_left_in_the_wrench_is_named(stages: Stages, words: str, view: View) -> None:
-    reading = replace(reading_of(view), stages=stages, frame=WrenchFrame("flange", (0.0, 0.01, -0.15)))
-    line = text(live_panels.head_lines(replace(view, reading=reading), 120)[1])
-    assert line.rstrip().endswith(f"{words}, flange @ (0,10,-150) mm")
 
 
 def test_a_calibration_of_another_cell_is_marked_in_the_header_and_not_green(view: View) -> None:

@@ -88,14 +88,6 @@ def test_every_size_is_filled_exactly() -> None:
         assert len(lines) == height
 
 
-def test_before_the_first_sample_the_screen_waits_and_the_page_has_its_place() -> None:
-    screen = LiveScreen(feed := SteppedFeed(FakeStream()), StreamSummary(feed), "http://127.0.0.1:8080/?token=abc")
-    lines = [str(line) for line in screen.lines(80, 24)]
-    assert "waiting for the first sample" in lines[1]
-    assert lines[3].strip(" ─") == "http://127.0.0.1:8080/?token=abc  v QR code"
-    assert len(lines[3]) == 80
-
-
 def test_keys_change_frame_and_stages_and_the_screen_says_what_the_numbers_are() -> None:
     screen = Screen()
     screen.press("x", "a", "a")

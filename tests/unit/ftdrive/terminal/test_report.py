@@ -21,7 +21,7 @@ from ftcalib.routine import DriftCheck
 from ftdrive.commands.solve import solve_command
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.console import answer, messages
-from ftdrive.terminal.report import print_cases, print_comparison, print_result
+from ftdrive.terminal.report import print_comparison, print_result
 from ftdrive.words.result import drift_in_use, drift_in_words, error_in_words, error_source
 from tests.unit.ftdrive.exports.example import calibration as followed
 from tests.unit.ftdrive.fake_cell import Lab
@@ -180,22 +180,6 @@ def test_a_narrow_terminal_gets_no_vectors_and_nothing_is_cut(
     assert ("force bias" in lines[0]) == vectors
     for line, one in zip(lines[2:], compared, strict=True):
         assert f" {one.mass_kg:.5f} " in line
-
-
-def test_the_columns_of_table_iii_fit_80_columns_with_three_digits(
-    compared: list[MethodResult], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    terminal(monkeypatch, 80)
-    errors = np.array([1.591, 0.1235, 0.0171, 1.854, 0.0084, 0.1051, 0.00044, 0.1092])
-    one = replace(compared[1], largest_errors=errors, mass_error=0.136, centre_error=0.00005)
-    print_cases([(10, "A+B+C+E+F+G", "D", one), (3, "B+C", "D", one), (4, "A", "D", compared[2])], known=False)
-    lines = capsys.readouterr().out.splitlines()
-    assert "Table III of Yu et al. 2021: largest errors on the test set" in lines[0]
-    assert max(map(len, lines)) <= 80
-    assert [line.split() for line in lines[-2:]] == [
-        [*f"{number} srom {data} D 1591 124 17.1 1854 8.40 105 0.440 109 13.6 0.005".split()]
-        for number, data in ((10, "all"), (3, "B+C"))
-    ]
 
 
 def rows_of(text: str) -> dict[str, list[str]]:

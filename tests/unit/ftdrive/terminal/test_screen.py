@@ -36,8 +36,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrive.terminal.operators import JsonOperator, PlainOperator
-from ftdrive.terminal.screen import Screen, draw_session, open_operator
+from ftdrive.terminal.screen import Screen, draw_session
 from ftdrive.words.session import SessionView
 from tests.wire.waiting import wait_until
 
@@ -347,13 +346,6 @@ def test_a_long_finding_goes_on_under_its_text() -> None:
     assert lines[0] == " ✔ payload: the controller carries 0.50"
     assert all(line.startswith(" " * 3) and len(line) <= 40 for line in lines[1:])
     assert " ".join(" ".join(lines).split()) == f"✔ payload: {words}"
-
-
-def test_without_a_terminal_there_are_plain_lines_and_json_where_asked_for() -> None:
-    with open_operator() as operator:
-        assert isinstance(operator, PlainOperator)  # the test's own stderr is captured
-    with open_operator(as_json=True) as operator:
-        assert isinstance(operator, JsonOperator)
 
 
 PROGRAM = """
