@@ -64,19 +64,6 @@ def test_a_wound_joint_is_unwound_and_never_wound_further() -> None:
         plan_approach(certifier, now + np.radians([0, 0, 0, 0, 0, 20]), USUAL_POSTURE_RAD, SLOW)
 
 
-def test_no_way_is_refused_with_the_joints_to_jog_to() -> None:
-    # Walls close around the column of the base hold the arm where it is.
-    walls = [Box((x, y, 0.0), (x + 0.05, y + 0.9, 2.0)) for x, y in ((-0.75, -0.9), (0.75, -0.9))]
-    front = [Box((-0.9, y, 0.0), (0.9, y + 0.02, 2.0)) for y in (0.25, -0.95)]
-    certifier = Certifier(ArmModel("UR5e", TOOL), Scene(boxes=(*walls, *front)))
-    now = USUAL_POSTURE_RAD.copy()
-    now[0] -= np.pi
-    open_ = Certifier(ArmModel("UR5e", TOOL), Scene())
-    assert open_.free(now)[0]
-    with pytest.raises(PlanRefused, match=r"jog .* 45, -100, 60, -50, 90, 45"):
-        plan_approach(certifier, now, USUAL_POSTURE_RAD, SLOW)
-
-
 def test_the_error_names_what_an_arm_stands_too_near_to() -> None:
     arm = ArmModel("UR5e", TOOL)
     low = float(arm.frames(USUAL_POSTURE_RAD).wrist_m[0, 2])

@@ -37,13 +37,9 @@ def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, mon
     stands = np.array(plan.steps[0].q_rad) + np.radians([20, 0, 0, 0, 0, 0])
     around = Scene((BASE_PLANE, WALL, SLANTING), (BOX,))
     draw_plan(plan, certifier_of(), tmp_path / "bare.png", ())
-    draw_plan(plan, certifier_of((TUBE, LUMP), around), tmp_path / "all.png", [stands, plan.steps[0].q_rad])
+    draw_plan(plan, certifier_of((TUBE, LUMP), around), tmp_path / "all.png", np.array([stands, plan.steps[0].q_rad]))
     areas = [[len(axes.patches) for axes in figure.axes] for figure in saved]
-    assert np.subtract(areas[1], areas[0]).tolist() == [
-        7,
-        8,
-        8,
-    ]  # the lump at 6 poses, box, and what is behind the wall
+    assert np.subtract(areas[1], areas[0]).tolist() == [7, 8, 8]  # 6 lumps, the box, and the wall
     lines = [[len(axes.lines) for axes in figure.axes] for figure in saved]
     assert np.subtract(lines[1], lines[0]).tolist() == [1, 2, 2]  # the way, and the edge of the wall
     assert [figure.axes[2].get_xlim()[1] > 0.8 for figure in saved] == [False, True]  # the wall

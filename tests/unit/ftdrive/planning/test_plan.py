@@ -181,11 +181,6 @@ def test_a_plan_that_only_another_arm_has_room_for_is_refused() -> None:
         plan.of_arm(behind_wall(other, wall_m))
 
 
-def test_a_real_arm_has_the_wrist_tours_of_a_nominal_one() -> None:
-    """Its wrist 2 is half a turn away at some poses, and a little more on a real arm."""
-    assert planned(certifier_of(kinematics=drawn("UR5e", 3)), poses=12).kind == usual(12).kind == "wrist"
-
-
 def test_plan_changed_by_hand_is_refused(tmp_path: Path) -> None:
     plan = usual()
     path = tmp_path / "plan.json"

@@ -128,42 +128,6 @@ def test_the_tracked_bias_ages_while_a_contact_hides_it() -> None:
     assert hidden["bias_fy"] == pytest.approx(-0.3, abs=0.1)
 
 
-class Unsteady:
-    def __init__(self, stream: Any, *reads: Any) -> None:
-        self.stream, self.reads, self.taken = stream, list(reads), 0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.stream, name)
-
-    def read(self) -> Any:
-        if not self.reads:
-            raise KeyboardInterrupt
-        found = self.reads.pop(0)
-        if isinstance(found, Exception):
-            raise found
-        return found
-
-    def take_events(self) -> list[Any]:
-        self.taken += 1
-        return []
-
-
-def test_a_silent_stream_is_reported_once_and_its_return_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ftdrive.servers.program.WEIGH_S", 0.0)
-    cell = Cell((POSE, NOTHING))
-    blocks = [cell.stream.read() for _ in range(3)]
-    broken = StreamBroken("no sample for 0.3 s")
-    unsteady = Unsteady(cell.stream, broken, broken, *blocks[:2], broken, blocks[2])
-    service = ProgramService(cast("Any", unsteady), cell.connect, cell.said.append)
-    with pytest.raises(KeyboardInterrupt):
-        service.run()
-    lost, again = "no sample for 0.3 s. The program sees a stale wrench.", "Samples arrive again."
-    assert cell.said == [lost, again, lost, again]
-    assert unsteady.taken == 7, "else they would pile up"
-    live = [one["live"] for one in cell.registers.written if one["condition"] != 3]
-    assert (live, cell.registers.written[-1]["state"]) == ([1, 2, 3], 0)
-
-
 def test_a_program_sees_that_the_service_has_ended() -> None:
     cell = Cell((POSE, NOTHING))
     cell.run(0.1)

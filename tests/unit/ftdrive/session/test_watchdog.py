@@ -201,25 +201,6 @@ def real_arm() -> FakeArm:
     return arm
 
 
-def test_the_thread_looks_by_itself_and_ends_with_its_block() -> None:
-    class Twice(Guard):
-        seen = 0
-        done = threading.Event()
-
-        def look(self, _: Seen) -> None:
-            assert threading.current_thread().name == "guards"
-            self.seen += 1
-            if self.seen == 3:
-                self.done.set()
-
-    guard = Twice()
-    with thread_of(real_arm(), guard) as watcher:
-        assert guard.seen >= 1
-        assert guard.done.wait(60.0)
-        watcher.check()
-    assert not [thread for thread in threading.enumerate() if thread.name == "guards"]
-
-
 def test_the_thread_stops_an_arm_that_does_not_answer_the_stop() -> None:
     arm = real_arm()
     answered, reported = threading.Event(), threading.Event()

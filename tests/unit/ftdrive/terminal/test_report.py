@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
-import click
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -19,7 +18,6 @@ from ftcalib.model import DriftResult, SPECIAL_R_flange_base, predict
 from ftcalib.result import Method
 from ftcalib.routine import DriftCheck
 from ftdrive.commands.solve import solve_command
-from ftdrive.errors import ConfigError
 from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.report import print_comparison, print_result
 from ftdrive.words.result import drift_in_use, drift_in_words, error_in_words, error_source
@@ -96,22 +94,6 @@ def terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
     monkeypatch.setattr(answer, "soft_wrap", False)
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     monkeypatch.setenv("COLUMNS", str(width))
-
-
-@pytest.mark.parametrize(
-    ("option", "value", "words"),
-    [
-        ("--mounting-deg", "nan,0,0", "--mounting-deg is 'nan,0,0': give 3 numbers"),
-        ("--up", "0,0,0", "--up is 0,0,0, which is not a direction: give 0,0,1"),
-    ],
-)
-def test_an_impossible_known_value_is_reported_as_it_was_given(
-    option: str, value: str, words: str, tmp_path: Path
-) -> None:
-    tilted().save(tmp_path / "data.json")
-    with pytest.raises((click.UsageError, ConfigError)) as error:
-        solve_command.main([str(tmp_path / "data.json"), option, value], standalone_mode=False)
-    assert words in str(error.value)
 
 
 def test_a_robot_on_a_wall_is_declared_by_an_option(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -190,34 +190,6 @@ def test_the_rest_is_that_of_the_terminal(page: Page) -> None:
     assert texts(watched.shown()["state/note"]).strip() == "a note"
 
 
-def test_while_a_question_waits_a_slider_shows_the_plan(lab: Lab, page: Page) -> None:
-    watched = Watched(page, lab.operator)
-    looks: list[dict[str, Any]] = []
-
-    def choose() -> None:
-        for value in (None, 0.0):
-            if value is not None:
-                page.act("viewer 0", "along", value)
-            looks.append(watched.shown())
-
-    lab.operator.at_question = [("Is the tool free", choose)]
-    run_with(lab, watched)
-    first, chosen = looks
-    plan = Plan.load(lab.run().plan_path)
-    (slider,) = first["question/along"]["controls"]
-    approach_s = slider["value"]
-    assert approach_s > 0
-    assert slider["text"].startswith(f"pose 1 of 6, {approach_s:.0f} of ")
-    assert slider["max"] == pytest.approx(approach_s + plan.motion_time_s, abs=0.11)
-    np.testing.assert_allclose(places(first, "ghost"), places_at(plan.nodes_rad[0]), atol=1e-4)
-    assert first["question/along"]["note"].startswith("Move 1 of 6, ")
-    assert chosen["question/along"]["controls"][0]["text"].startswith("approach, 0 of ")
-    np.testing.assert_allclose(places(chosen, "ghost"), places(chosen), atol=1e-4)
-    assert "question/along" not in watched.shown()
-    with pytest.raises(ValueError, match="does not have this control now"):
-        page.act("viewer 0", "along", 0.0)
-
-
 def test_the_arm_and_its_next_pose_are_drawn(lab: Lab, page: Page) -> None:
     watched = Watched(page, lab.operator)
     at: list[dict[str, Any]] = []
