@@ -1,7 +1,6 @@
 """How `ftdrive doctor` examines an arm and a push, with devices that answer from a list."""
 
 import json
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -109,49 +108,6 @@ def test_an_emulated_push_is_along_x_of_the_base_and_ends(monkeypatch: pytest.Mo
     pushed, ended = np.array(asked)
     np.testing.assert_allclose(TURN @ pushed[:3], [15, 0, 0], atol=1e-12)
     assert not ended.any()
-
-
-Printed = Callable[..., list[str]]
-
-
-@pytest.fixture
-def printed(lab: Lab, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Printed:
-    monkeypatch.chdir(tmp_path)
-
-    def run(*checks: Check, options: Sequence[str] = ()) -> list[str]:
-        *others, last = checks
-        for name, found in (
-            ("build_sensor", lab.sensor),
-            ("examine_arm", (others, None)),
-            ("examine_sensor", ([], False)),
-            ("computer.check_permissions", []),
-            ("computer.check_disk", last),
-        ):
-            monkeypatch.setattr(f"ftdrive.commands.doctor.{name}", lambda *_, found=found, **__: found)
-        cli.run(["doctor", "--sensor", "bota:///dev/x", *options])
-        return [line.strip() for line in capsys.readouterr().out.splitlines()]
-
-    return run
-
-
-def test_a_summary_has_each_subject_and_all_that_needs_attention(printed: Printed) -> None:
-    assert printed(
-        Check("robot.reachable", "ok", "it answers"),
-        Check("robot.identity", "ok", "UR5e"),
-        Check("robot.remote", "ok", "remote control on"),
-        Check("robot.speed", "warning", "slider at 30 %", "raise it"),
-        Check("noise.level", "failed", "saturated", "take the load off"),
-        Check("noise.change", "skipped", "not known"),
-        Check("push.sign", "skipped", "no push"),
-    ) == [
-        "robot       ✔ UR5e (2 more checks passed)",
-        "! slider at 30 %",
-        "fix: raise it",
-        "noise       ✘ saturated",
-        "fix: take the load off",
-        "push        - no push",
-        "Not ready (3 passed, 2 skipped; --all shows each).",
-    ]
 
 
 def test_a_sensor_alone_is_checked_without_a_robot(

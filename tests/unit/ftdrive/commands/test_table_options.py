@@ -52,18 +52,6 @@ def test_columns_may_be_named_on_the_line_and_in_a_file(solved: Solved) -> None:
     near(parameters(solved(renamed, "--columns", "columns.toml")), expected)
 
 
-def test_what_is_recognised_of_the_text_can_be_given(solved: Solved) -> None:
-    expected = parameters(solved(PLAIN))
-    Path("text.toml").write_text('[text]\nseparator = ","\ndecimal = "."\n')
-    near(parameters(solved(PLAIN, "--columns", "text.toml")), expected)
-    Path("text.toml").write_text('[text]\nseparator = ";"\n')
-    code, _, err = solved(PLAIN, "--columns", "text.toml")
-    assert code == 6
-    assert "no row has two numbers or more" in err
-    Path("text.toml").write_text('[text]\nseparator = "|"\n')
-    assert "[text]: separator '|'" in solved(PLAIN, "--columns", "text.toml")[2]
-
-
 def test_a_unit_may_have_a_size(solved: Solved) -> None:
     scaled = PLAIN | {name: values / 0.82 for name, values in wrench(POSES).items() if name.startswith("f")}
     near(

@@ -1,6 +1,5 @@
 """A plain WebSocket client reads what the server sends, and decodes it with other implementations."""
 
-import base64
 import importlib
 import json
 import re
@@ -11,7 +10,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -20,7 +18,6 @@ from ftdrive.servers import foxglove
 from ftdrive.servers.foxglove import ARROWS, EVENTS, STATUS, FoxgloveServer
 from ftdrive.stream import ros2
 from ftdrive.stream.samples import Stages, StreamEvent, WrenchFrame
-from ftdrivers.interfaces import Array
 from tests.unit.ftdrive.servers.fake_stream import INFO, UTC_OFFSET_NS, Client, FakeStream, block, serving
 
 
@@ -47,15 +44,6 @@ def read_cdr(client: Client, topic: str, payload: bytes) -> Any:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(channel["schema"], channel["schemaName"]))
     return store.deserialize_cdr(payload, channel["schemaName"])
-
-
-def read_protobuf(client: Client, topic: str, payload: bytes) -> Any:
-    channel = client.channels[topic]
-    assert (channel["encoding"], channel["schemaEncoding"]) == ("protobuf", "protobuf")
-    pool = descriptor_pool.DescriptorPool()
-    for file in descriptor_pb2.FileDescriptorSet.FromString(base64.b64decode(channel["schema"])).file:
-        pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(channel["schemaName"])).FromString(payload)
 
 
 def stamp_ns(stamp: Any) -> int:
@@ -130,22 +118,6 @@ def test_frames_lead_from_base_to_the_frame_of_the_wrench(server: FoxgloveServer
     for name, (R, p) in expected.items():
         assert np.allclose(poses[name][0], R), name
         assert np.allclose(poses[name][1], p), name
-
-
-@pytest.mark.parametrize("force_N", [(3.0, -4.0, 12.0), (0.0, 0.0, 0.0)])
-def test_arrows_show_force_and_torque(server: FoxgloveServer, client: Client, force_N: tuple[float, ...]) -> None:
-    client.subscribe(ARROWS)
-    sent = block(1, frame=WrenchFrame("base", "tcp"))
-    sent.wrench[-1] = [*force_N, 0.0, 0.6, 0.8]
-    server.add(sent, [])
-    (entity,) = read_protobuf(client, ARROWS, client.message()[2]).entities
-    assert entity.frame_id == "base_at_tcp"
-    vectors: list[Array] = []
-    for arrow in entity.arrows:
-        q = arrow.pose.orientation
-        along = Rotation.from_quat([q.x, q.y, q.z, q.w]).apply([arrow.shaft_length + arrow.head_length, 0, 0])
-        vectors.append(along + numbers(arrow.pose.position))
-    assert np.allclose(vectors, np.array([[0.01 * x for x in force_N], [0, 0.06, 0.08]]))  # 10 N and 1 N·m are 100 mm
 
 
 def test_the_status_says_what_is_shown_and_is_valid_json(server: FoxgloveServer, client: Client) -> None:

@@ -1,8 +1,6 @@
 """Keys, and how a run goes on, on the fake cell: pause, stop, skip, redo, --resume, by hand."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +9,12 @@ import pytest
 
 from ftdrive.cell.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
-from ftdrive.planning.search.nodes import constant_tour
 from ftdrive.runs.run import Run
 from ftdrive.session import drive
 from ftdrive.session.events import (
     Estimated,
     Event,
     Key,
-    Noted,
     PoseTaken,
     RunOpened,
 )
@@ -206,32 +202,6 @@ def test_a_run_by_hand_goes_on_by_hand(mode: str, lab: Lab) -> None:
         lab.take_poses(resume=run.folder, mode="step")
     with pytest.raises(ConfigError, match="leave out --redo"):
         lab.take_poses(resume=run.folder, redo=(1,))
-
-
-def by_hand(lab: Lab, at_pose: Callable[[int], None] = lambda _: None) -> None:
-    """Another client moves the arm on after each pose; there are no keys."""
-    poses, clock_s, state = constant_tour(lab.arm.q), count(step=0.6), lab.arm.state
-
-    def on_event(event: Event) -> None:
-        if isinstance(event, PoseTaken):
-            at_pose(event.stop)
-            lab.arm.q = poses[event.stop]
-
-    lab.arm.state = lambda: replace(state(), t_device_s=next(clock_s))  # type: ignore[method-assign]
-    lab.operator.has_keys, lab.operator.on_event = False, on_event
-
-
-def test_a_session_that_is_interrupted_says_how_to_solve_what_is_there(lab: Lab) -> None:
-    def at_pose(stop: int) -> None:
-        if stop == 3:
-            raise KeyboardInterrupt
-
-    by_hand(lab, at_pose)
-    with pytest.raises(KeyboardInterrupt):
-        lab.take_poses(mode="manual")
-    words = lab.operator.of(Noted)[-1].words
-    assert words.endswith(f"or solve them with\n{lab.run().solve_command}")
-    assert lab.run().stops() == [1, 2, 3]
 
 
 def test_options_that_cannot_be_used_are_reported_before_anything_opens(lab: Lab) -> None:

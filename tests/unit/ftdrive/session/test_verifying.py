@@ -133,22 +133,6 @@ def test_a_step_of_the_bias_is_named_and_the_update_names_its_parent(
     assert not last.passed
 
 
-def test_given_limits_decide_instead_of_the_prediction(
-    lab: Lab, calibration: CalibrationResult, take: Callable[..., Run]
-) -> None:
-    lab.sensor.push = np.array([0.3, 0.4, 0.0, 0.0, 0.0, 0.0])
-    run = take()
-    assert verified(run, calibration, (0.8, None)).passed
-    strict = verified(run, calibration, (0.1, 0.1))
-    assert not strict.passed
-    (words,) = strict.exceeded
-    assert "--max-force 0.1 N" in words
-    assert [path.name for path in sorted(run.folder.glob("verification*"))] == [
-        "verification-2.json",
-        "verification.json",
-    ]
-
-
 def test_a_completed_plan_is_driven_again_and_fast(lab: Lab, take: Callable[..., Run]) -> None:
     first = Plan.load(take(fast=True).plan_path)
     slowest = max(speed for _, speed, _ in lab.arm.moves)

@@ -21,7 +21,6 @@ from ftdrive.stream import processing
 from ftdrive.stream.processing import Processor
 from ftdrive.stream.samples import Axes, Block, FrameTransform, Links, LinkStatus, Paired, Point, Stages, WrenchFrame
 from ftdrive.stream.stages import stages_in_words
-from tests.moving_load import HOME, flange
 from tests.unit.ftdrive.stream.simulated import (
     NOISE,
     P_FLANGE_SENSOR_M,
@@ -261,16 +260,6 @@ def test_a_moving_arm_with_a_free_tool_is_no_contact_from_its_first_motion_on() 
     assert not block.in_contact[:9000].any()
     assert block.in_contact[9200:9500].all()
     assert not block.in_contact[9700:].any()
-
-
-def test_joint_noise_of_a_resting_arm_is_neither_motion_nor_noise_of_the_sensor() -> None:
-    arm_Hz = 500
-    q_rad = HOME + 2e-5 * np.random.default_rng(8).normal(size=(6 * arm_Hz, 6))
-    R, p = (np.repeat(poses, 1000 // arm_Hz, axis=0) for poses in flange(q_rad))
-    at_rest = paired(np.tile(flange(HOME[None])[0], (6000, 1, 1)))
-    _, block = processed(replace(at_rest, R_base_flange=R, p_base_flange_m=p))
-    assert block.sigma == pytest.approx(NOISE, rel=0.1)
-    assert np.mean(block.chi2[2000:]) == pytest.approx(6.0, rel=0.2)
 
 
 # ------------------------------------------------------------------------------------------------------ tare and drift

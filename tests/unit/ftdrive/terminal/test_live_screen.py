@@ -2,7 +2,6 @@
 
 import time
 from contextlib import nullcontext
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -106,17 +105,6 @@ def test_keys_tare_undo_and_mark() -> None:
     lines = screen.press("enter")
     assert screen.stream.called == ["tare", "tare-undone", "mark"]
     assert 'mark "q hi"' in lines[-3]
-
-
-def test_a_key_pushes_the_tool_of_an_emulated_cell_only() -> None:
-    pushes: list[str] = []
-    assert "f push" not in Screen().press("f")[-1]
-    screen = Screen()
-    screen.feed.push = partial(pushes.append, "pushed")
-    lines = screen.press("f")
-    assert pushes == ["pushed"]
-    assert "f push" in lines[-1]
-    assert "the emulated tool is pushed" in lines[-3]
 
 
 def test_a_replay_pauses_steps_seeks_and_says_where_it_is() -> None:

@@ -2,7 +2,6 @@
 
 import json
 import time
-import weakref
 from dataclasses import replace
 from typing import Any
 
@@ -144,24 +143,6 @@ def test_no_old_value_of_a_silent_device() -> None:
 def _still(certifier: Certifier) -> set[str]:
     """What a page shows of a scene before the first sample."""
     return {name for name in parts_of(Shown(FakeStream(), certifier=certifier).page) if name.startswith("scene/")}
-
-
-def test_without_a_viewer_nothing_is_shown_and_nothing_piles_up() -> None:
-    alive: list[weakref.ref[Any]] = []
-
-    class Watched(FakeStream):
-        def read(self) -> Any:
-            block = super().read()
-            alive.append(weakref.ref(block.chi2))
-            return block
-
-    shown = Shown(Watched())
-    shown.page.viewers = 0
-    assert "numbers" not in shown.run(50)
-    assert sum(one() is not None for one in alive) <= 1
-    shown.page.viewers = 1
-    shown.live.draw()
-    assert {"numbers", "plots"} <= parts_of(shown.page).keys()
 
 
 def test_viewers_tare_and_choose_the_frame_only_if_that_is_allowed() -> None:
