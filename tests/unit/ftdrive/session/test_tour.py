@@ -10,13 +10,15 @@ import pytest
 from ftcalib.sampling import Sampling
 from ftdrive.cell.config import WorkcellConfig
 from ftdrive.errors import NotAccepted
-from ftdrive.planning.motion import Speeds, tips
+from ftdrive.planning.approach import plan_approach
+from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, guess_of, plan_tour
 from ftdrive.session import preflight
 from ftdrive.session.along_plan import has_completed, remember_completed
-from ftdrive.session.drive import Progress
+from ftdrive.session.drive import APPROACH_RAD_S, SLOW, Progress
 from ftdrive.session.events import Asked, Checked, Key, Noted, Planned, PoseTaken, State
+from ftdrive.session.tour import moves_s
 from ftdrive.words.session import in_words
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from tests.unit.ftdrive.fake_cell import MODEL, Lab
@@ -94,6 +96,18 @@ def test_how_long_to_average_is_chosen_from_the_noise_of_the_sensor(lab: Lab) ->
     (average_s,) = {pose.average_s for pose in lab.operator.of(PoseTaken)}
     assert 1.5 <= average_s <= 4.0
     assert f"average {average_s:.1f} s at each pose" in " ".join(note.words for note in lab.operator.of(Noted))
+
+
+def test_the_rest_of_a_tour_counts_what_is_left_and_the_ways_past_what_is_not(lab: Lab) -> None:
+    certifier = certifier_for(lab.cell, "UR5e")
+    plan = plan_tour(certifier, USUAL_POSTURE_RAD, 24, speeds=Speeds(), guess=guess_of(certifier))
+    third = np.array(plan.steps[2].q_rad)
+    there = plan_approach(certifier, third, third, SLOW)
+    one = plan.steps[2].duration_s
+    assert moves_s(plan, [3, 4], there) == pytest.approx(moves_s(plan, [3], there) + one)
+    past = np.abs(np.subtract(plan.steps[8].q_rad, plan.steps[2].q_rad)).max()
+    expected_s = float(move_duration_s(past, APPROACH_RAD_S, SLOW.joint_rad_s2))
+    assert moves_s(plan, [3, 9], there) - moves_s(plan, [3], there) == pytest.approx(expected_s)
 
 
 def has_run(lab: Lab) -> bool:

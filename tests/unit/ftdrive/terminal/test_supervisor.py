@@ -86,15 +86,6 @@ def test_a_writer_that_leaves_at_the_question_itself_is_gone(pipes: Pipes) -> No
         JsonOperator(stdin=pipes.stdin, stdout=Leaving()).ask(Question("Go on?"))
 
 
-def test_answers_that_were_all_prepared_may_end(pipes: Pipes) -> None:
-    os.write(pipes.answers, b"yes\nMOVE\n")
-    os.close(pipes.answers)
-    assert [pipes.supervisor.read_line("?") for _ in range(2)] == ["yes\n", "MOVE\n"]
-    assert pipes.supervisor.absence() is None
-    with pytest.raises(Declined, match="no answer"):
-        pipes.supervisor.read_line("no answer")
-
-
 def test_a_question_that_waits_ends_with_its_reader(pipes: Pipes) -> None:
     os.close(pipes.seen)
     with pytest.raises(SupervisorGone, match="standard output"):
