@@ -128,6 +128,12 @@ def test_a_replay_pauses_steps_seeks_and_says_where_it_is() -> None:
     assert "+0.0" in lines[5] or "-0.0" in lines[5]
 
 
+class Paced(FakeStream):
+    def read(self) -> Block:
+        time.sleep(0.001)  # else its thread leaves the screen no time
+        return super().read()
+
+
 class Other(FakeStream):
     def read(self) -> Block:
         if self.blocks < 3:
@@ -138,7 +144,7 @@ class Other(FakeStream):
 @pytest.mark.parametrize(
     ("stream", "ends"),
     [
-        (FakeStream(), nullcontext()),
+        (Paced(), nullcontext()),
         (FakeStream(silent_after=30), pytest.raises(DeviceTimeout, match="sent no sample")),
         (Other(), pytest.raises(ConfigError, match="another device")),
     ],
