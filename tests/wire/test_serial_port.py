@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import serial
 
-from ftdrivers.errors import PortInUse
+from ftdrivers.errors import ConnectError, PortInUse
 from ftdrivers.wires.serial_port import SerialPort
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
@@ -173,3 +173,15 @@ def test_a_port_that_another_program_has_is_said_to_be_in_use(far_side: FarSide)
         port.open()
     port.open()
     port.close()
+
+
+def test_a_port_that_takes_no_flags_is_freed(far_side: FarSide, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: object) -> bool:
+        raise termios.error(5, "gone")
+
+    monkeypatch.setattr("ftdrivers.wires.serial_port.ask_for_marks", refuse)
+    port = SerialPort("sensor", far_side.path, 1_250_000, even_parity=True)
+    with pytest.raises(ConnectError, match="gone"):
+        port.open()
+    assert not port.is_open
+    serial.Serial(far_side.path, exclusive=True).close()

@@ -1,6 +1,7 @@
 """Addresses of sensors: what they build, and what is refused before any device is touched."""
 
 import contextlib
+import json
 from collections.abc import Callable
 from importlib.metadata import EntryPoint
 from inspect import signature
@@ -9,9 +10,11 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
+from click.testing import CliRunner
 
-from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.cell.config import FORMAT, CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.devices import build_arm
+from ftdrive.commands import doctor
 from ftdrive.errors import ConfigError
 from ftdrivers.bota.sensor import BotaSensor
 from ftdrivers.errors import BadUrl
@@ -144,7 +147,7 @@ def test_mistakes_are_named(url: str, message: str) -> None:
 ACME = """
 import time
 import numpy as np
-from ftdrivers.interfaces import DeviceInfo, FtSamples
+from ftdrivers.interfaces import ArmStatus, DeviceInfo, Diagnosis, FtSamples
 from ftdrivers.streaming import StreamingSensor
 from ftdrivers.ur.arm import UrArm
 
@@ -169,7 +172,24 @@ class Sensor(StreamingSensor):
         pass
 
 class Arm(UrArm):
-    pass
+    def open(self, *, control=False):
+        pass
+
+    def close(self):
+        pass
+
+    def identify(self):
+        return DeviceInfo("Acme arm", "7", "2.0")
+
+    def in_remote_control(self):
+        return None
+
+    def diagnose(self):
+        return [Diagnosis("brakes", False, "a brake is worn", "call Acme")]
+
+    def status(self):
+        now_ns = time.monotonic_ns()
+        return ArmStatus(now_ns, now_ns / 1e9, "running", "normal", "stopped", None, 1.0, 1.0, None, None, None)
 """
 
 Install = Callable[..., None]
@@ -253,3 +273,39 @@ def test_a_class_that_is_no_driver_is_named(install: Install) -> None:
     install("odd_ft", "[ftdrive.sensors]\nodd = odd_ft:Sensor\n", "class Sensor:\n    pass\n")
     with pytest.raises(BadUrl, match=r"odd://x: odd_ft:Sensor has no from_url, .*; reinstall odd_ft"):
         sensor_from_url("odd://x")
+
+
+def test_doctor_asks_the_arm_of_another_package_only_what_any_arm_knows(install: Install, tmp_path: Path) -> None:
+    points = "[ftdrive.sensors]\nacme-usb = acme_arm:Sensor\n[ftdrive.arms]\nacme = acme_arm:Arm\n"
+    install("acme_arm", points, ACME)
+    path = tmp_path / "ftdrive.toml"
+    path.write_text(
+        f'format = "{FORMAT}"\n[robot]\nhost = "127.0.0.1"\ndriver = "acme"\n[sensor]\nurl = "acme-usb:///dev/acme0"\n',
+        encoding="utf-8",
+    )
+    arguments = ["--config", str(path), "--runs", str(tmp_path), "--json"]
+    outcome = CliRunner().invoke(doctor.doctor, arguments)
+    checks = {check["name"]: check for check in json.loads(outcome.stdout)["checks"]}
+    robot = {name: check for name, check in checks.items() if name.startswith("robot.")}
+    assert robot["robot.reachable"]["found"] == "127.0.0.1 answers"
+    assert robot["robot.identity"]["found"] == "Acme arm, serial 7, firmware 2.0"
+    brakes = robot.pop("robot.brakes")
+    assert (brakes["state"], brakes["found"], brakes["fix"]) == ("failed", "a brake is worn", "call Acme")
+    assert {check["state"] for check in robot.values()} == {"ok", "skipped"}
+    assert checks["clock.pace"]["state"] == "ok"
+
+
+PLAIN = """
+class Sensor:
+    @classmethod
+    def from_url(cls, address, options, *, sign=1):
+        return cls()
+"""
+
+
+def test_a_driver_that_is_no_stream_of_ours_takes_no_options_of_ours(install: Install) -> None:
+    install("plain_ft", "[ftdrive.sensors]\nplain = plain_ft:Sensor\n", PLAIN)
+    assert type(sensor_from_url("plain://x")).__module__ == "plain_ft"
+    for option in ("recover=1", "range=1,1", "serial=A"):
+        with pytest.raises(BadUrl, match="no options recover, serial and range"):
+            sensor_from_url(f"plain://x?{option}")

@@ -138,3 +138,9 @@ def test_reads_within_two_milliseconds_are_one_line_with_the_time_of_the_first(t
 )
 def test_the_address_of_a_player(url: str, frames: bool, at: str) -> None:
     assert Transcript({"url": url}, 0, (), {}, frames=frames).url_at("/dev/pts/3") == at
+
+
+def test_a_folder_that_is_not_there_is_said_to_be_the_fault(tmp_path: Path) -> None:
+    path = tmp_path / "nope" / "a.jsonl"
+    with pytest.raises(OSError, match=f"^{path} cannot be written .No such file"):
+        Writer(path, {"url": "x", "duration_s": 1})

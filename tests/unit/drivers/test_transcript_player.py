@@ -153,3 +153,30 @@ def test_what_the_driver_does_not_accept_yet_is_sent_later_and_in_order() -> Non
     ):
         port.write(b"ab")
         assert port.read(len(data) + 3) == data + b"end"
+
+
+def test_two_requests_may_arrive_at_once() -> None:
+    wire = Played(recorded((0.0, True, b"ab"), (0.0, True, b"cd"), (0.01, False, b"3")))
+    wire.ask(b"abcd")
+    assert wire.answers(0.02) == b"3"
+    wire.ask(b"xy")  # the driver says goodbye, or the recording was broken off
+    assert wire.divergence is None
+
+
+def test_a_player_that_is_never_opened_ends() -> None:
+    before = threading.active_count()
+    with Player(DIALOGUE):
+        pass
+    assert threading.active_count() == before
+
+
+def test_how_much_is_left() -> None:
+    wire = Played(DIALOGUE)
+    assert wire.left_s == pytest.approx(0.31)
+    wire.ask(b"ab")
+    assert wire.left_s == pytest.approx(0.26)
+    wire.answers(0.1)
+    assert wire.left_s == pytest.approx(0.06)
+    wire.ask(b"cd")
+    wire.answers(0.1)
+    assert wire.left_s == 0

@@ -114,3 +114,8 @@ def test_a_recording_in_memory_is_shown_and_a_frame(recorded: Path, monkeypatch:
     frame = recording.to_frame()
     assert list(frame)[:3] == ["t_s", "t_utc_s", "t_host_ns"]
     np.testing.assert_array_equal(frame["fz"], recording.rows["wrench"][:, 2])
+
+
+def test_a_run_that_is_none_is_shown_all_the_same(tmp_path: Any) -> None:
+    assert "is not a run folder" in repr(ftdrive.Run(tmp_path))
+    assert repr(ftdrive.Run(tmp_path)).startswith(f"Run {tmp_path}")

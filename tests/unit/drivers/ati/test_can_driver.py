@@ -256,3 +256,30 @@ def test_an_adapter_on_a_serial_port_wants_its_interface() -> None:
         AtiCanSensor("/dev/ttyACM0").open()
     assert "interface=slcan" in caught.value.fix
     assert "ip link" not in str(caught.value)
+
+
+def test_stale_frames_are_purged_before_a_request(make_wire: MakeWire) -> None:
+    """A duplicate left over from the last reading must not become half of the next one."""
+    with opened(make_wire(last=[*GAUGES, (1.1, "200 0000700070007000")])) as sensor:
+        assert (sensor.collect(0.05).counts == COUNTS).all()
+
+
+def test_a_missing_device_is_known_after_three_attempts(table: Table) -> None:
+    with table.can([("205", [])] * 3) as wire:
+        start_s = wire.clock.now_s()
+        with pytest.raises(ConnectError, match="SERIAL"):
+            opened(wire).open()
+        assert wire.clock.now_s() - start_s == pytest.approx(0.3, abs=0.01)
+
+
+@pytest.mark.parametrize(("after_ms", "asked"), [(99.0, 1), (101.0, 2), (None, 2)])
+def test_a_reply_of_the_start_up_has_a_tenth_of_a_second_and_is_asked_again(
+    table: Table, after_ms: float | None, asked: int
+) -> None:
+    reply = START_UP["205"]
+    late = [] if after_ms is None else [(after_ms, reply[0])]
+    turns = [("205", late), ("205", reply)][:asked]
+    rest = [(sent, received) for sent, received in START_UP.items() if sent != "205"]
+    wire = table.can(chain(turns, rest, repeat(("200", GAUGES))))
+    with opened(wire):
+        left_alone(wire)

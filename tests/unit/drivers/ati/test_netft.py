@@ -6,6 +6,7 @@ import struct
 import sys
 import threading
 import time
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Self
 
@@ -16,8 +17,8 @@ from ftdrivers.ati.netft import (
     NetFtSensor,
     transformation_in,
 )
-from ftdrivers.errors import BadUrl, ConnectError, DeviceFault
-from ftdrivers.interfaces import Fact
+from ftdrivers.errors import BadUrl, ConnectError, DeviceFault, StreamBroken
+from ftdrivers.interfaces import Fact, Health
 from ftdrivers.registry import sensor_from_url
 from tests.cell_time import CellTime
 
@@ -233,3 +234,39 @@ def test_tool_transformation_that_cannot_be_undone_is_refused(page: bytes) -> No
         pytest.raises(ConnectError, match=r"cannot be undone.*set it to zero"),
     ):
         box.sensor().open()
+
+
+def test_silence_ends_the_stream() -> None:
+    with Box() as box, box.sensor() as sensor:
+        box.mute = True
+        heard_s = sensor.latest(timeout_s=0.5).t_host_ns[0] / 1e9
+        with pytest.raises(StreamBroken, match=r"ended \(nothing arrived for 0\.3"):
+            sensor.collect(60.0)
+        # The silence ended it, not the time of `collect`; a busy computer adds to the 0.3 s.
+        assert 0.3 <= box.time.of_drivers.now_s() - heard_s < 30
+
+
+def test_what_was_thrown_away_is_counted_since_open() -> None:
+    with Box(*map(record, [1, 2, 2, 3, 5, 4, 6]), RECORD[:-1]) as box:
+        sensor = box.sensor()
+        sensor.recover = True
+        counted: list[tuple[int, int, int]] = []
+
+        def wait_for(condition: Callable[[Health], bool]) -> None:
+            while not condition(health := sensor.health()):
+                counted.append((health.duplicated, health.out_of_order, health.malformed))
+                time.sleep(0.005)
+
+        with sensor:
+            wait_for(lambda health: (health.duplicated, health.out_of_order, health.malformed) == (1, 1, 1))
+            counted.clear()
+            box.mute_and_then = [*map(record, [1, 2, 2, 3])]
+            wait_for(lambda health: health.reconnects > 0)
+            wait_for(lambda health: health.duplicated == 2)
+            sensor.latest(timeout_s=1.0)
+        after = sensor.health()
+        assert (after.duplicated, after.out_of_order, after.malformed) == (2, 1, 1)
+        assert set(counted) <= {(1, 1, 1), (2, 1, 1)}  # nothing is forgotten while there is no stream
+        sensor.open()
+        assert sensor.health().duplicated == 0
+        sensor.close()

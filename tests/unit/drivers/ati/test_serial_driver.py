@@ -255,3 +255,11 @@ def test_refusals_end_the_start_up_at_once(table: Table, request_: bytes, reply:
     with wire, pytest.raises(ConnectError, match=rf"^ATI serial sensor on .*{message}") as caught:
         Sensor(wire.clock).open()
     assert "address" in caught.value.fix
+
+
+def test_a_missing_device_is_known_within_a_second(table: Table) -> None:
+    with table.serial([*[(JAM, b""), (STATUS, b"")] * 3, BYE]) as wire:
+        start_s = wire.clock.now_s()
+        with pytest.raises(ConnectError, match="no reply"):
+            Sensor(wire.clock).open()
+        assert wire.clock.now_s() - start_s < 0.5

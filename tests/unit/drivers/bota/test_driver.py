@@ -117,3 +117,18 @@ def test_frames_that_end_name_the_line(table: Table) -> None:
     wire = table.serial([], few)
     with wire, pytest.raises(ConnectError, match=r"3 frames arrived within 5\.\d s at 460800 baud; check supply"):
         Sensor(wire.clock, baud=460_800).open()
+
+
+def test_a_sample_that_comes_twice_is_one(table: Table) -> None:
+    times = [10_000 * k for k in range(1, 20)]
+    with table.serial([], stream(*times, times[-1])) as wire, Sensor(wire.clock) as sensor:
+        samples = sensor.collect(0.2)
+        assert sensor.health().duplicated == 1
+    assert (np.diff(samples.seq) == 1).all()
+
+
+def test_bytes_without_frames_are_named_beside_a_command(table: Table) -> None:
+    wire = table.serial([(b"C", NOISE)] * 5)
+    with wire, pytest.raises(ConnectError, match="'C' was not confirmed .* at 115200 baud" + OTHER_BAUD) as caught:
+        Sensor(wire.clock, baud=115_200, sinc=512).open()
+    assert "sinc=512" not in str(caught.value)

@@ -83,3 +83,12 @@ def test_slow_usb_adapter_is_named_with_its_fix(
     assert len(warned) == bool(hint)  # one fault, one warning
     assert all(hint in text for text in warned)
     assert events == [f"rate {rate_Hz:.1f} Hz instead of 100 Hz"] * bool(hint)
+
+
+def test_sensor_that_streams_since_it_booted_is_stopped_and_its_silence_waited_for(table: Table) -> None:
+    with table.serial([HALT, SERIAL, FIRMWARE, RUN, HALT], Stream.of(FRAME, 0.01)) as wire:
+        start_s = wire.clock.now_s()
+        wire.clock.advance(0.1)
+        with Sensor(wire.clock) as sensor:
+            assert len(sensor.collect(0.1)) > 3
+        assert wire.clock.now_s() - start_s > 0.1 + 0.05

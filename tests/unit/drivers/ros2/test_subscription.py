@@ -61,3 +61,9 @@ def test_stamps_of_another_clock_are_reported(graph: Graph, behind_ms: float, wo
     found = clock_diagnosis(cast("Any", graph), 1005.0 - 1e-3 * behind_ms)
     assert words in found.found
     assert found.passed
+
+
+def test_a_topic_that_subscribers_alone_know_is_no_topic_of_its_type(graph: Graph) -> None:
+    graph.get_topic_names_and_types = lambda: [(TOPIC, [KIND])]  # type: ignore[method-assign]
+    with pytest.raises(ConnectError, match="no topic has this type"):
+        subscribed(graph)

@@ -621,3 +621,23 @@ class TestFollow:
             assert fake.health().reconnects == 1
             assert samples.seq[0] > 100
             assert len(samples) == 3
+
+
+def test_constructor_touches_nothing() -> None:
+    fake = FakeSensor()
+    assert fake.connects == 0
+    with pytest.raises(StreamBroken, match="not open"):
+        fake.check()
+    with pytest.raises(ConnectError, match="open it first"):
+        fake.identify()
+
+
+def test_a_rate_that_is_right_again_is_said_and_so_is_the_next_wrong_one(sensor: FakeSensor) -> None:
+    sensor.expect_rate(200.0)
+    t_s, seq = 0.0, 5
+    for rate_Hz in (100.0, 200.0, 100.0):
+        for _ in range(round(4.5 * rate_Hz)):
+            t_s, seq = t_s + 1 / rate_Hz, seq + 1
+            sensor.feed.append(sensor.block([seq], after_s=t_s))
+    sensor.settle()
+    assert ["again" in what for _, what in sensor.health().events] == [False, True, False]

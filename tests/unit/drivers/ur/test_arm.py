@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from ftdrivers.interfaces import Guard
 from ftdrivers.ur import arm as arm_module
 from ftdrivers.ur import opening
@@ -464,3 +464,50 @@ def test_a_question_to_our_program_has_four_tenths_of_a_second(
         move(arm, controller)
     assert ours or 0.4 <= clock.now_s() - begin_s < 0.43
     assert controller.control.alive == ours
+
+
+def test_a_new_arm_opens_no_connection_and_closes() -> None:
+    arm = UrArm(HOST, model="ur5e", speed_rad_s=radians(60))
+    arm.stop()
+    arm.close()
+    arm.close()
+    with pytest.raises(ConnectError, match="not open"):
+        arm.identify()
+
+
+def test_an_unknown_control_path_is_refused() -> None:
+    with pytest.raises(ValueError, match="auto, ur-rtde, script"):
+        UrArm(HOST, control="urscript")  # type: ignore[arg-type]
+
+
+def test_opening_twice_starts_one_program(arm: UrArm, controller: Controller) -> None:
+    arm.open(control=True)
+    arm.open()
+    assert controller.did == ["start our program"]
+
+
+def test_what_rtde_may_not_say_refuses_the_opening_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def damaged(*_: object, **__: object) -> None:
+        raise ProtocolError("RTDE recipe cannot be read: 01", "is this an RTDE server?")
+
+    monkeypatch.setattr(arm_module, "Reader", damaged)
+    with pytest.raises(ConnectError, match="recipe cannot be read: 01") as error:
+        UrArm(HOST).open()
+    assert error.value.fix == "is this an RTDE server?"
+
+
+def test_a_lost_connection_is_reported_at_once(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    provoke = After(clock, 0.3, setting(controller, failure=StreamBroken("closed")))
+    with pytest.raises(StreamBroken):
+        move(arm, controller, provoke)
+    assert provoke.ago_s() < 0.05
+    assert controller.did[-1] == "dashboard stop"
+    assert controller.dashboard_limits_s[-1] == 0.4
+
+
+def test_another_program_found_before_a_move_is_left_alone(arm: UrArm, controller: Controller) -> None:
+    controller.hanging = {"tcp_offset"}
+    with pytest.raises(DeviceFault, match="another program"):
+        move(arm, controller)
+    arm.close()
+    assert controller.did == ["start our program"]

@@ -375,3 +375,48 @@ def test_a_shorter_silence_is_none(controller: Controller, reader: Reader, clock
     clock.at(0.18, speak)  # the sample after the silence came without being waited for, as far as anybody knows
     reader.look()
     assert not reader.silent
+
+
+@pytest.mark.parametrize("mode", [3, 4])
+def test_joints_without_power_are_not_measured(controller: Controller, reader: Reader, mode: int) -> None:
+    controller.robot_mode = mode
+    with pytest.raises(DeviceFault, match="measure its joints"):
+        reader.state(never)
+    controller.robot_mode = 5  # idle: powered, brakes closed
+    reader.state(never)
+
+
+def test_the_end_of_the_stream_is_raised_at_a_follower(
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
+) -> None:
+    with full_rate.follow() as follow:
+        clock.advance(0.004)
+        controller.failure = ConnectionResetError("reset")
+        clock.advance(0.004)
+        assert len(follow.read(0.1)) == 2
+        for _ in range(2):
+            with pytest.raises(StreamBroken, match="reset"):
+                follow.read(0.1)
+    with pytest.raises(StreamBroken, match="reset"), full_rate.follow():
+        pytest.fail("a stream that has failed was followed")
+
+
+def test_poses_without_power_over_the_joints_are_not_read(
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
+) -> None:
+    with full_rate.follow() as follow:
+        clock.advance(0.004)
+        controller.robot_mode = 5  # idle: powered, brakes closed
+        clock.advance(0.006)
+        controller.robot_mode = 3
+        clock.advance(0.01)
+        assert len(follow.read(0.0)) == 5
+        with pytest.raises(DeviceFault, match="measure its joints"):
+            follow.read(0.1)
+
+
+def test_a_follower_refuses_another_arm(controller: Controller) -> None:
+    reader = ReaderInMemory(controller, "UR5e")
+    reader.info = replace(reader.info, model="UR10e")
+    with reader.follow() as follow, pytest.raises(DeviceFault, match="another model"):
+        follow.read(0.1)

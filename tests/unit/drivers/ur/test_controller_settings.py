@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ControllerSettings
 from ftdrivers.ur import controller_settings
 from ftdrivers.ur.arm import UrArm
@@ -162,3 +162,26 @@ def test_everything_that_a_controller_reports_is_read(monkeypatch: pytest.Monkey
     stream = Stream(outputs)
     assert read(stream, monkeypatch) == ControllerSettings(1.442, (0.01, 0.0, 0.08), INERTIA, (0.0, 0.3, 9.81))
     assert stream.closed
+
+
+def test_a_control_process_that_hangs_is_an_error(arm: UrArm, controller: Controller) -> None:
+    controller.hanging.add("set_payload")
+    began_s = controller.clock.now_s()
+    with pytest.raises((DeviceTimeout, StreamBroken)):
+        arm.set_payload(1.0, (0, 0, 0.05))
+    assert controller.clock.now_s() - began_s < 2.5
+
+
+@pytest.mark.parametrize(("failure", "kind"), [(TimeoutError(), DeviceTimeout), (ConnectionResetError(), StreamBroken)])
+def test_a_link_that_fails_is_an_error_of_the_device(
+    monkeypatch: pytest.MonkeyPatch, failure: Exception, kind: type[Exception]
+) -> None:
+    stream = Stream({}, failure)
+    with pytest.raises(kind, match=HOST):
+        read(stream, monkeypatch)
+    assert stream.closed
+
+
+def test_a_closed_arm_reads_nothing() -> None:
+    with pytest.raises(ConnectError, match="not open"):
+        UrArm(HOST).controller_settings()

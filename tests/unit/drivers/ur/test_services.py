@@ -149,3 +149,8 @@ def test_a_device_that_does_not_answer(
     monkeypatch.setattr(services, "DASHBOARD_PORT", 1)
     with pytest.raises(NoDashboard, match=f"the {name} of .* reports: .*refused.*{fix}"):
         ask(version, everything)
+
+
+def test_an_early_robot_api_does_not_know_everything() -> None:
+    with an_api({("GET", "/program/v1/state"): (200, {"state": "STOPPED"})}) as (port, _):
+        assert ask(VX, everything, port) == (None, None, None, "STOPPED", None)

@@ -123,3 +123,18 @@ def test_old_controllers_do_not_report_it(controller: SubscriptionInMemory, sens
 def test_without_a_scale_there_is_no_sensor(query: str, says: str) -> None:
     with pytest.raises(BadUrl, match=says):
         sensor_from_url(f"ur-ft://192.168.1.10{query}")
+
+
+def test_lost_connection(controller: SubscriptionInMemory, sensor: Wrist) -> None:
+    controller.ends_after_s = 0.1
+    sensor.open()
+    begin_s = controller.clock.now_s()
+    with pytest.raises(StreamBroken, match="connection was lost"):
+        sensor.collect(5.0)
+    assert controller.clock.now_s() - begin_s < 0.12
+
+
+def test_a_wrench_that_is_no_number_ends_the_stream(controller: SubscriptionInMemory, sensor: Wrist) -> None:
+    controller.raw = [math.nan] * 6
+    with pytest.raises(ConnectError, match="not finite"):
+        sensor.open()

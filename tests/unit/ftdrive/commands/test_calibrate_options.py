@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from ftcalib.errors import BadDataset
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
-from ftdrive.cell.emulated import Station
+from ftdrive.cell.emulated import REAL_PACE, Station
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError
 from ftdrive.runs.load import Load
@@ -190,3 +190,10 @@ def test_a_run_with_a_field_of_the_wrong_type_is_refused_in_one_sentence(
     assert isinstance(outcome.exception, BadDataset)
     assert str(outcome.exception).startswith(f"{folder / 'run.json'}: '{next(iter(wrong))}")
     assert cells == stations == []
+
+
+@pytest.mark.parametrize(("place", "pace"), [(("--at", "tip=0,0,200"), REAL_PACE), (("--gripped",), ())])
+@pytest.mark.usefixtures("cells")
+def test_a_load_on_a_string_needs_the_pace_of_a_real_arm(place: Any, pace: Any, stations: list[Any]) -> None:
+    call("--simulate", "--load", "2.0", *place)
+    assert stations.pop()[1] == pace

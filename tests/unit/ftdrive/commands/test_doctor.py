@@ -10,7 +10,7 @@ import pytest
 
 from ftdrive import cli
 from ftdrive.checks import sensor as of_sensor
-from ftdrive.checks.arm import check_clock
+from ftdrive.checks.arm import check_clock, check_flange
 from ftdrive.checks.check import Check
 from ftdrive.checks.sensor import PUSH_S, examine_push
 from ftdrive.commands import doctor
@@ -129,3 +129,18 @@ def test_a_sensor_alone_is_checked_without_a_robot(
     assert states[1] == (7, "failed")
     assert cli.run(["doctor"]) == 2  # without a sensor there is nothing to check
     assert "[robot] host is not set" in capsys.readouterr().err
+
+
+def test_the_pose_is_read_in_millimetres() -> None:
+    arm, silent = (cast("Any", Arm(FakeClock(), until=until)) for until in (10**6, 0))
+    read, unknown = (cast("Any", SimpleNamespace(tcp_offset=one)) for one in (np.zeros(6), None))
+    assert check_flange(arm, read).found == "TCP offset reported; flange at (100, -200, 346) mm in base"
+    failed = check_flange(silent, read)
+    assert (failed.state, failed.fix) == ("failed", "look at the cable")
+    assert check_flange(arm, unknown).state == "skipped"
+
+
+def test_without_a_reading_or_a_push_there_is_no_sign(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert examined(None, monkeypatch)[0].state == "skipped"
+    assert examined(Sensor(), monkeypatch, pushes=False)[0].found == "no push: the standard input is closed"
+    assert examined(Sensor(silent=True), monkeypatch)[0].state == "failed"

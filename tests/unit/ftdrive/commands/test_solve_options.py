@@ -38,3 +38,15 @@ def test_options_that_do_not_go_together_are_refused(
     assert isinstance(error, ConfigError)
     assert words in str(error)
     assert not Path("new.json").exists()
+
+
+def test_each_of_several_sources_that_fail_is_named_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b", "empty"):
+        Path(name).mkdir()
+    for path in ("first.csv", "a/poses.csv", "b/poses.csv"):
+        Path(path).write_text("p,q\n1,2\n")
+    printed = CliRunner().invoke(cli, ["solve", "first.csv", "empty"]).output
+    assert [printed.count(name) for name in ("error: ", "first.csv", "empty")] == [2, 1, 1]
+    alike = CliRunner().invoke(cli, ["solve", "a/poses.csv", "b/poses.csv"]).output
+    assert [alike.count(path) for path in ("a/poses.csv", "b/poses.csv")] == [1, 1]

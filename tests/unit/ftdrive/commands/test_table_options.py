@@ -8,6 +8,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
+from ftdrive import cli
 from ftdrive.runs.source import _forward
 from tests.ros2.seven_joints import URDF
 from tests.unit.ftdrive.tables.test_layouts import POSES, quaternion, t, text, wrench
@@ -97,3 +98,11 @@ def test_an_option_that_cannot_be_used_is_one_sentence(options: list[str], words
     assert out == ""
     assert words in err
     assert err.count("error:") + err.count("Error:") == 1
+
+
+def test_options_of_a_table_do_not_go_with_other_data(solved: Solved) -> None:
+    near(parameters(solved(PLAIN)), parameters(solved(PLAIN, "--rate", "1")))  # poses have their times in any case
+    from ftdrive import read_dataset
+
+    read_dataset("poses.csv").save("dataset.json")
+    assert cli.run(["solve", "dataset.json", "--sign", "-1"]) == 2

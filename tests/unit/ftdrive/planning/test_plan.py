@@ -19,6 +19,7 @@ from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan, digest, fingerprints
 from ftdrive.planning.planner import TOOL_POSES, USUAL_POSTURE_RAD, guess_of, plan_for, plan_tour
 from ftdrive.planning.search.tours import shortest_tour
+from ftdrivers.sweep import Sweep
 from ftdrivers.ur.kinematics import MODELS as NOMINAL
 from ftdrivers.ur.kinematics import Array, Kinematics
 from tests.own_kinematics import drawn
@@ -225,3 +226,11 @@ def test_shortest_tour_is_the_best_of_all() -> None:
 def test_posture_that_cannot_be_is_refused() -> None:
     with pytest.raises(ConfigError, match="degrees"):
         planned(certifier_of(), np.full(6, np.nan))
+
+
+def test_a_sweep_of_another_arm_is_refused() -> None:
+    plan = replace(
+        usual(), sweep=Sweep(USUAL_POSTURE_RAD.tolist(), np.zeros((3, 2)), np.ones((3, 2)), np.zeros((3, 2)), 20, 3)
+    )
+    with pytest.raises(PlanRefused, match="other kinematics"):
+        plan.of_arm(certifier_of(kinematics=drawn("UR5e")))

@@ -9,7 +9,7 @@ from ftcalib.poses.information import special
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.geometry.scene import BASE_PLANE, Scene
+from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_verification
@@ -38,3 +38,10 @@ def test_gravity_is_far_from_where_it_was_in_the_calibration() -> None:
 def test_one_pose_is_too_few() -> None:
     with pytest.raises(ConfigError, match="1 poses cannot verify"):
         plan(1)
+
+
+def test_another_posture_is_found_and_named() -> None:
+    ceiling = Plane((0.0, 0.0, -1.0), -0.75)
+    made = plan(6, Certifier(CERTIFIER.arm, Scene((BASE_PLANE, ceiling))))
+    assert made.certified
+    assert "A tour exists with joints 1 to 3 at" in made.why[1]

@@ -211,3 +211,12 @@ def test_without_the_extra_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, FoxgloveServer.__module__)
     with pytest.raises(ConfigError, match="a server needs foxglove-sdk, of the extra stream"):
         importlib.import_module(FoxgloveServer.__module__)
+
+
+def test_arrows_and_frames_come_at_most_60_times_a_second(server: FoxgloveServer, client: Client) -> None:
+    client.subscribe(ARROWS, ros2.TRANSFORMS, STATUS)
+    for start in range(0, 7000, 35):
+        server.add(block(35, start), [])
+    server.add(None, [StreamEvent(0, "mark", "")])
+    topics = [client.message()[0] for _ in range(122)]
+    assert (topics.count(ARROWS), topics.count(ros2.TRANSFORMS), topics.count(STATUS)) == (60, 60, 2)

@@ -1,5 +1,6 @@
 """The service for a program: which registers it writes, and how it answers."""
 
+import threading
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -168,3 +169,66 @@ def test_a_wrench_without_new_samples_is_stale_and_a_lost_controller_is_called_a
     wait_until(lambda: cell.said[-1] == "The controller answers again.")
     cell.service.end()
     assert cell.registers.written[-1]["state"] == 0
+
+
+def test_a_push_is_a_contact_and_its_weight_is_refused() -> None:
+    cell = Cell(*[(POSE, NOTHING)] * 3, (POSE, np.array([5.0, 8.0, 0, 0, 0, 0])))
+    cell.run(0.2)
+    cell.ask(6, ZERO)
+    cell.run(2.2)
+    pushed = cell.ask(7, WEIGH, 0.8)
+    assert (pushed["condition"], pushed["state"], pushed["code"], pushed["mass"]) == (1, 3, 4, 0)
+
+
+class Unsteady:
+    def __init__(self, stream: Any, *reads: Any) -> None:
+        self.stream, self.reads, self.taken = stream, list(reads), 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+    def read(self) -> Any:
+        if not self.reads:
+            raise KeyboardInterrupt
+        found = self.reads.pop(0)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def take_events(self) -> list[Any]:
+        self.taken += 1
+        return []
+
+
+def test_a_silent_stream_is_reported_once_and_its_return_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ftdrive.servers.program.WEIGH_S", 0.0)
+    cell = Cell((POSE, NOTHING))
+    blocks = [cell.stream.read() for _ in range(3)]
+    broken = StreamBroken("no sample for 0.3 s")
+    unsteady = Unsteady(cell.stream, broken, broken, *blocks[:2], broken, blocks[2])
+    service = ProgramService(cast("Any", unsteady), cell.connect, cell.said.append)
+    with pytest.raises(KeyboardInterrupt):
+        service.run()
+    lost, again = "no sample for 0.3 s. The program sees a stale wrench.", "Samples arrive again."
+    assert cell.said == [lost, again, lost, again]
+    assert unsteady.taken == 7, "else they would pile up"
+    live = [one["live"] for one in cell.registers.written if one["condition"] != 3]
+    assert (live, cell.registers.written[-1]["state"]) == ([1, 2, 3], 0)
+
+
+def test_ctrl_c_ends_the_service_while_it_starts_and_says_nothing_of_a_controller_that_has_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Interrupted(threading.Thread):
+        def start(self) -> None:
+            super().start()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("ftdrive.servers.program.threading.Thread", Interrupted)
+    cell = Cell((POSE, NOTHING))
+    cell.registers.broken = True
+    threads = threading.active_count()
+    with pytest.raises(KeyboardInterrupt):
+        cell.service.run()
+    assert threading.active_count() == threads
+    assert cell.said == []

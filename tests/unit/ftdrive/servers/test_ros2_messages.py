@@ -12,6 +12,7 @@ from ftdrive.servers import ros2
 from ftdrive.servers.parameters import Fixed
 from ftdrive.servers.ros2 import Level, PartState, TransformPublisher, reports_of
 from ftdrive.stream.samples import LinkStatus, Stages, StreamStatus, WrenchFrame
+from ftdrivers.errors import NoRos2
 from tests.unit.ftdrive.terminal.fake_stream import INFO, R_BASE_FLANGE, FakeStream
 
 LINK = LinkStatus(998.4, 1000.0, 7, 0.0012)
@@ -134,3 +135,15 @@ def test_a_frame_that_turns_and_on_request_the_flange_are_published_as_they_move
     unknown = replace(at_tcp, p_base_flange_m=np.full((len(block), 3), np.nan))
     TransformPublisher(node, replace(FIXED, publish_base_tf=True)).publish(unknown, INFO, 10**9)
     assert len(node.published) == 1
+
+
+def test_without_tf2_nothing_is_published(node: FakeNode, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> Any:
+        raise NoRos2(name)
+
+    monkeypatch.setattr(ros2, "ros2_module", missing)
+    found = TransformPublisher(node, FIXED)
+    found.use(INFO)
+    found.publish(FakeStream().read(), INFO, 10**9)
+    assert not node.published
+    assert "ur_tool0 to wrist_ft is not published" in node.logged[0]

@@ -452,3 +452,25 @@ def test_without_an_operator_it_ends_and_what_is_committed_stands() -> None:
 
     outcome = Outcome(dwells(*AROUND), at_commit=leave, raises=pytest.raises(SupervisorGone, match="terminal"))
     assert outcome.stops == [1, 2]
+
+
+def test_if_the_arm_moves_off_while_measured_the_time_to_wait_is_shown() -> None:
+    outcome = Outcome([*dwells(UP, seconds=2.0), *dwells(DOWN)])
+    assert outcome.stops == [1]
+    assert "moved while pose 1" in outcome.person.words()
+
+
+def test_a_sensor_that_recovers_is_waited_for_and_its_failure_is_reported_once() -> None:
+    outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), recover=True, unplugged_s=9.5)  # while pose 2 is averaged
+    assert outcome.stops == [1, 2, 3]
+    assert outcome.person.words().count("a cable came off") == 1
+    assert outcome.person.words().count("connected again") == 1
+    outcome = Outcome(dwells(UP, DOWN), unplugged_s=8.0, raises=pytest.raises(StreamBroken))
+    assert outcome.stops == [1]
+    assert "a cable came off" in outcome.person.words()
+
+
+def test_a_mean_that_changes_is_seen_at_the_first_pose_too() -> None:
+    outcome = Outcome([Dwell(UP, 30.0, wrench=lambda t: np.outer(np.minimum(t, 5.0), np.full(6, 0.2)))])
+    assert "its mean still changes" in outcome.person.words()
+    assert outcome.kept[-1].steady

@@ -233,3 +233,23 @@ def test_tilts_with_a_hanging_load_are_enough_for_its_run() -> None:
     tilts = tilted_candidates(np.radians([45, 75]), 4, 0.0, (0.0, 0.0, -1.0))
     hung = Load.of("2.0", "tip=0,0,200", gripped=False)
     assert (run(records(tilts)).light, run(records(tilts), RunningFit(load=hung)).light) == ("amber", "green")
+
+
+def test_a_bumped_pose_stands_out_when_it_comes_and_can_be_taken_again() -> None:
+    running, taken = RunningFit(), tour()
+    run(taken[:13], running)
+    quiet = running.add(taken[13])
+    assert quiet.residual_sigma is not None
+    assert quiet.residual_sigma < 5
+    bumped = running.add(record(15, special([TOUR[14]])[0], TOUR[14], bump_N=1.0))
+    assert bumped.residual_sigma is not None
+    assert bumped.residual_sigma > 8
+    assert bumped.residual_force_N == pytest.approx(1.0, abs=0.2)
+    running.remove(15)
+    assert running.result is not None
+    assert running.result.n_poses == 14
+    again = running.add(taken[14])
+    assert again.poses == 15
+    assert again.residual_sigma is not None
+    assert again.residual_sigma < 5
+    running.remove(99)

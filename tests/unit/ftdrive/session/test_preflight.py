@@ -15,7 +15,8 @@ from ftdrive.checks import computer
 from ftdrive.checks.check import Check
 from ftdrive.errors import NotAccepted
 from ftdrive.session import preflight
-from ftdrive.session.events import Checked
+from ftdrive.session.events import Checked, Noted
+from ftdrivers.errors import StreamBroken
 from ftdrivers.interfaces import ArmState, DeviceInfo, Fact
 from tests.unit.ftdrive.fake_cell import Lab
 from tests.unit.ftdrive.session.scenarios import Action, status
@@ -245,3 +246,16 @@ def test_the_computer_is_kept_awake_by_a_process_that_ends_with_our_end_of_its_p
         assert words.startswith("this computer is kept awake") == granted
         assert not ended.exists()
     assert ended.exists() == granted
+
+
+def test_a_sensor_that_stumbles_once_is_opened_again(lab: Lab) -> None:
+    def stumble() -> None:
+        lab.sensor.collecting = lambda: None
+        raise StreamBroken("a write took too long")
+
+    lab.sensor.collecting = stumble
+    assert lab.take_poses(dry_run=True) is None
+    assert "trying once more" in " ".join(event.words for event in lab.operator.of(Noted))
+    lab.sensor.failure = StreamBroken("gone for good")
+    with pytest.raises(StreamBroken):
+        lab.take_poses(dry_run=True)

@@ -1,6 +1,8 @@
 """Keys, and how a run goes on, on the fake cell: pause, stop, skip, redo, --resume, by hand."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -9,18 +11,20 @@ import pytest
 
 from ftdrive.cell.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
+from ftdrive.planning.search.nodes import constant_tour
 from ftdrive.runs.run import Run
 from ftdrive.session import drive
 from ftdrive.session.events import (
     Estimated,
     Event,
     Key,
+    Noted,
     PoseTaken,
     RunOpened,
 )
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
 from tests.unit.ftdrive.fake_cell import Lab
-from tests.unit.ftdrive.session.scenarios import Case, cases, once, press
+from tests.unit.ftdrive.session.scenarios import Case, at, both, cases, once, press
 
 
 def broken_off(lab: Lab, mode: str = "auto") -> Path:
@@ -224,3 +228,39 @@ def test_options_that_cannot_be_used_are_reported_before_anything_opens(lab: Lab
         with pytest.raises((ConfigError, PlanRefused), match=words):
             lab.take_poses(**given)
     assert lab.arm.opened == opened
+
+
+def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> None:
+    at(lab, "taken 3", both(press(Key.REDO), lambda lab: at(lab, "measuring 3", press(Key.SKIP))))
+    outcome = lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
+    assert "pose 3 keeps" in lab.said()
+    assert outcome is not None
+    assert outcome.result.n_poses == 6
+    assert [event.poses for event in lab.operator.of(Estimated)][:5] == [1, 2, 3, 3, 4]
+
+
+def by_hand(lab: Lab, at_pose: Callable[[int], None] = lambda _: None) -> None:
+    """Another client moves the arm on after each pose; there are no keys."""
+    poses, clock_s, state = constant_tour(lab.arm.q), count(step=0.6), lab.arm.state
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, PoseTaken):
+            at_pose(event.stop)
+            lab.arm.q = poses[event.stop]
+
+    lab.arm.state = lambda: replace(state(), t_device_s=next(clock_s))  # type: ignore[method-assign]
+    lab.operator.has_keys, lab.operator.on_event = False, on_event
+
+
+def test_a_session_that_is_interrupted_says_how_to_solve_what_is_there(lab: Lab) -> None:
+    def at_pose(stop: int) -> None:
+        if stop == 3:
+            raise KeyboardInterrupt
+
+    by_hand(lab, at_pose)
+    with pytest.raises(KeyboardInterrupt):
+        lab.take_poses(mode="manual")
+    words = lab.operator.of(Noted)[-1].words
+    assert words.endswith(f"or solve them with\n{lab.run().solve_command}")
+    assert lab.run().stops() == [1, 2, 3]

@@ -155,3 +155,11 @@ def seen(t_s: float, R: Array, wrench: Array, sample: int, curve: Array | None) 
     motion = ExpectedMotion(np.zeros(6), np.zeros(6), True, curve)
     state = ArmState(0, 0.0, np.zeros(6), np.zeros(6), R, np.zeros(3))
     return Seen(t_s, 0.01, motion, state, STATUS, wrench, sample, 0.0)
+
+
+def test_the_plan_of_a_sweep_is_not_driven_as_a_tour(lab: Lab) -> None:
+    run = lab.sweep(real=False)
+    sweeps = len(lab.arm.sweeps)
+    with pytest.raises(ConfigError, match="is the plan of a sweep: leave out --plan"):
+        lab.take_poses(plan=run.plan_path)
+    assert len(lab.arm.sweeps) == sweeps

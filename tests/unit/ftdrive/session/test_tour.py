@@ -18,6 +18,7 @@ from ftdrive.session import preflight
 from ftdrive.session.along_plan import has_completed, remember_completed
 from ftdrive.session.drive import APPROACH_RAD_S, SLOW, Progress
 from ftdrive.session.events import Asked, Checked, Key, Noted, Planned, PoseTaken, State
+from ftdrive.session.guards import Limits, StallGuard
 from ftdrive.session.tour import moves_s
 from ftdrive.words.session import in_words
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
@@ -244,3 +245,9 @@ def test_the_arm_stands_until_it_leaves_and_may_return_to_where_it_came_from() -
     now.skipped.clear()
     now.lose_place()
     assert now.came_from is None
+
+
+def test_the_plan_of_a_dry_run_is_looked_at_until_enter(lab: Lab) -> None:
+    assert lab.take_poses(dry_run=True, watch=lambda *_: StallGuard(Limits())) is None
+    assert [question.answers for question in lab.operator.asked] == [("",)]
+    assert lab.arm.moves == []

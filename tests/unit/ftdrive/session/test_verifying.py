@@ -20,7 +20,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Reading, Run
 from ftdrive.runs.verification import NO_LIMITS, Limits, Verified, save_update, verification_near, verify_run
 from ftdrive.session.along_plan import has_completed
-from ftdrive.session.events import Compared
+from ftdrive.session.events import Compared, Noted, PoseTaken
 from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.session import take_poses
 from ftdrive.session.verifying import RunningComparison, Verifying
@@ -186,3 +186,12 @@ def test_only_fresh_poses_count_by_hand(lab: Lab, calibration: CalibrationResult
     assert (near.light, bool(near.hint)) == ("amber", True)
     tilted = Rotation.from_euler("x", 40, degrees=True).as_matrix()
     assert comparison.add(turned(records[2], tilted)).light == "green"
+
+
+def test_a_calibration_without_its_poses_is_verified_with_a_warning(
+    lab: Lab, calibration: CalibrationResult, take: Callable[..., Run]
+) -> None:
+    (lab.folder / "runs" / str(calibration.provenance["run"]) / "dataset.json").unlink()
+    take()
+    assert any("poses of the calibration are unknown" in note.words for note in lab.operator.of(Noted) if note.warning)
+    assert lab.operator.of(PoseTaken)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 
+from ftdrive.errors import ConfigError
 from ftdrive.stream.samples import Block, StreamEvent
 from ftdrive.stream.stream import Sink
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream, SteppedFeed
@@ -54,3 +55,17 @@ def test_a_full_disk_ends_the_recording_and_not_the_screen() -> None:
     assert tape.closed == 1
     assert feed.recording_s is None
     assert "recording stopped with an error: [Errno 28] No space left on device" in [note.text for note in notes]
+
+
+def test_a_request_that_is_refused_is_a_line_on_the_screen() -> None:
+    def refuse() -> None:
+        raise ConfigError("a torque about the tcp needs [sensor] height_mm")
+
+    feed = SteppedFeed(FakeStream())
+    blocks, notes = feed.subscribe()
+    feed.do(refuse)
+    feed.do(feed.switch_recording)
+    feed.step(2)
+    assert notes[0].text == "a torque about the tcp needs [sensor] height_mm"
+    assert "use `ftdrive record" in notes[1].text
+    assert len(blocks) == 2

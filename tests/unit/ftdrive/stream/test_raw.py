@@ -1,10 +1,12 @@
 """A sensor alone: its readings minus a tare, without a word about an arm or a calibration."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ftdrive import cli
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.recording.compensation import compensate_recording
 from ftdrive.recording.foreign import TablePair
@@ -12,6 +14,7 @@ from ftdrive.recording.recorder import RawTable
 from ftdrive.stream.sources import CellSource
 from ftdrive.stream.stream import Stream
 from ftdrive.tables.table import Table
+from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.stream.simulated import NOISE, calibrated
 from tests.unit.ftdrive.stream.test_stream import RATE_HZ, Sensor
@@ -73,3 +76,28 @@ def test_what_is_saved_is_compensated_beside_a_table_of_poses(sensor: Sensor, tm
     assert found["samples"] == len(t_s)
     # the free tool of the calibration hangs on the sensor
     assert found["compensated"]["force_rms_N"] == pytest.approx(NOISE[0] * np.sqrt(3), rel=0.2)
+
+
+def test_a_silent_sensor_raises_and_recovers(sensor: Sensor) -> None:
+    with raw(sensor) as stream:
+        stream.read()
+        sensor.silent = True
+        with pytest.raises(DeviceTimeout):
+            list(stream)
+        status = stream.status()
+        assert status.sensor.error
+        assert not status.arm.error
+        sensor.silent = False
+        assert len(stream.read())
+
+
+def test_a_program_gets_readings_and_no_verdict(
+    sensor: Sensor, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sensor.push = LOAD
+    monkeypatch.setattr("ftdrive.commands.live.CellSource", lambda *_: raw(sensor).source)
+    assert cli.run(["live", "--raw", "--sensor", "fake://", "--once", "--json"]) == 0
+    reading = json.loads(capsys.readouterr().out)
+    assert reading["raw"]["force_N"] == pytest.approx((sensor.motion.wrench(np.zeros(1))[0] + LOAD)[:3], abs=0.05)
+    for name in ("compensated", "contact", "calibration", "calibration_id", "verdict", "delay_s", "verification"):
+        assert reading[name] is None

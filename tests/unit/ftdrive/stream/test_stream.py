@@ -1,5 +1,6 @@
 """The stream of a cell: what it opens and refuses, gaps and silence, recovery, and what it reports."""
 
+import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -10,10 +11,14 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult
+from ftcalib.after.series import BiasTemperature
+from ftcalib.display import MOST_LINES
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.errors import ConfigError
 from ftdrive.library import open_stream
 from ftdrive.runs.calibration import FOREIGN, read_calibration
+from ftdrive.store import tools as named_tools
+from ftdrive.store.tools import Tool
 from ftdrive.stream import sources as module
 from ftdrive.stream.contact import Contact
 from ftdrive.stream.samples import Stages, WrenchFrame
@@ -280,3 +285,73 @@ def test_a_stream_is_opened_from_paths(cell: Cell, tmp_path: Any) -> None:
     assert read_calibration(tmp_path).mass_kg == pytest.approx(cell.calibration.mass_kg)  # as a run folder
     with pytest.raises(ConfigError, match="no calibration"):
         open_stream(cell.config)
+
+
+def test_a_stream_is_shown_before_it_is_open_read_and_closed(cell: Cell) -> None:
+    stream = cell.stream()
+    assert "not open" in repr(stream)
+    stream.open()
+    assert "no sample was read yet" in repr(stream)
+    stream.read()
+    assert re.search(r"force now x, y, z +-?0\.\d\d, -?0\.\d\d, -?0\.\d\d N in sensor axes", repr(stream))
+    assert len(repr(stream).splitlines()) <= MOST_LINES
+    assert "<table>" in stream._repr_html_()
+    stream.close()
+    stream.close()
+
+
+def test_a_plot_has_the_samples_from_its_call_on(cell: Cell) -> None:
+    pytest.importorskip("matplotlib")
+    with cell.stream() as stream:
+        stream.read()
+        cell.clock.sleep(0.2)  # samples of a pause wait in the links
+        figure = stream.plot(0.5)
+    lines = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 2]
+    assert len(lines) == 3
+    for line in lines:
+        t_s = line.get_xdata()
+        assert t_s[0] == pytest.approx(0, abs=2e-3)
+        assert t_s[-1] == pytest.approx(0.5, abs=0.02)
+        assert np.std(line.get_ydata()) == pytest.approx(NOISE[0], rel=0.2)
+
+
+def test_a_device_that_sends_nothing_is_named(cell: Cell) -> None:
+    cell.arm.rate_Hz = 0.1
+    with pytest.raises(DeviceTimeout, match="arm sent"), cell.stream():
+        pass
+
+
+def test_an_emulated_cell_excludes_a_real_one(cell: Cell) -> None:
+    with pytest.raises(ConfigError, match="leave config, tool, sensor and arm out"):
+        open_stream(cell.config, cell.calibration, simulate=True)
+    with cell.stream() as stream, pytest.raises(ConfigError, match="only a stream with simulate=True"):
+        _ = stream.station
+
+
+def test_the_bias_follows_the_temperature_of_the_sensor(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    slope, sigma = np.array([0.2, 0, 0, 0, 0, 0.01]), np.full(6, 1e-3)
+    errors = np.full(2, 0.1), np.full(2, 0.5)
+    warmth = BiasTemperature(slope, sigma, 12, 20.0, 40.0, *errors, np.zeros(2))
+    made = replace(cell.calibration, provenance={**cell.calibration.provenance, "temperature_C": 25.0})
+    monkeypatch.setattr(named_tools, "calibration_of_tool", lambda *_, **__: Tool(made, Path("c.json"), (), warmth))
+    cell.sensor.now_C = 25.0
+
+    def wait(seconds: float) -> None:
+        end_s = cell.clock.now_s() + seconds
+        until(stream, lambda: cell.clock.now_s() > end_s)
+
+    with Stream(CellSource(cell.config, "gripper")) as stream:
+        wait(1.2)
+        cell.sensor.now_C = 31.0
+        cell.sensor.push = 6 * slope
+        wait(0.7)
+        wrench = stream.read().wrench.mean(axis=0)
+        assert np.abs(wrench / NOISE).max() < 3, "what the temperature does is no force"
+        (event,) = [event for event in stream.take_events() if event.kind == "temperature"]
+        assert event.values == {"temperature_C": 31.0, "change": pytest.approx((6 * slope).tolist())}
+        assert stream.tare().kind == "tare"
+        assert stream.status().tare == pytest.approx(6 * slope, abs=0.1)
+        cell.sensor.now_C, cell.sensor.push = 33.0, 8 * slope
+        wait(0.7)
+        assert np.abs(stream.read().wrench.mean(axis=0) / NOISE).max() < 3, "from the tare on only what came after it"
+        assert not stream.read().in_contact.any()

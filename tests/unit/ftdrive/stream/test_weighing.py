@@ -12,6 +12,7 @@ import ftdrive
 from ftcalib import CalibrationResult
 from ftcalib.model import Array
 from ftcalib.sensor_matrix import SensorMatrix
+from ftdrive.errors import ConfigError
 from ftdrive.stream.noise import unexplained_variance
 from ftdrive.stream.samples import Paired
 from ftdrive.stream.stream import Stream
@@ -198,3 +199,12 @@ def test_what_a_fit_does_not_explain_is_in_the_reading() -> None:
             noise_explains=explained, likely_error=lambda _: (0.05, 0.002), predicted_error=lambda: (0.03, 0.003)
         )
         np.testing.assert_allclose(unexplained_variance(calibration), variance)
+
+
+def test_weighing_in_motion_needs_a_stream_that_follows() -> None:
+    source = carried(0.0)
+    with pytest.raises(CannotWeigh, match="too few samples"):
+        weigh_in_motion(source)
+    source.track = "off"
+    with pytest.raises(ConfigError, match="track"):
+        weigh_in_motion(source)

@@ -2,6 +2,7 @@
 
 import time
 from contextlib import nullcontext
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from ftdrive.terminal.console import messages
 from ftdrive.terminal.live_screen import LiveScreen, draw_live, run_live
 from ftdrive.words.stream import StreamSummary
 from ftdrivers.errors import DeviceTimeout
+from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.stream.simulated import calibrated, dwells, info, paired, replayed
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream, Scenario, SteppedFeed
 from tests.wire.waiting import wait_until
@@ -168,3 +170,23 @@ def test_a_failure_is_the_end_of_the_command_and_recordings_are_named(
         run_live(feed)
     assert f"Recorded: {tmp_path}/live-" in said.get().replace("\n", "")
     tape.end.assert_called_once()
+
+
+def test_a_frame_that_is_not_configured_is_left_out_and_named() -> None:
+    screen, rows = Screen(blocks=0), paired(dwells(1, 2000, seed=1), rate_Hz=100.0)
+    screen.show(replayed(info(calibrated(), height=False), rows, clock=FakeClock()))
+    screen.step(3)
+    screen.press("a")
+    assert any("set [sensor] height_mm" in note.text for note in screen.summary.view().notes)
+    assert screen.stream.frame == WrenchFrame()
+
+
+def test_a_key_pushes_the_tool_of_an_emulated_cell_only() -> None:
+    pushes: list[str] = []
+    assert "f push" not in Screen().press("f")[-1]
+    screen = Screen()
+    screen.feed.push = partial(pushes.append, "pushed")
+    lines = screen.press("f")
+    assert pushes == ["pushed"]
+    assert "f push" in lines[-1]
+    assert "the emulated tool is pushed" in lines[-3]

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
+import click
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -18,6 +19,7 @@ from ftcalib.model import DriftResult, SPECIAL_R_flange_base, predict
 from ftcalib.result import Method
 from ftcalib.routine import DriftCheck
 from ftdrive.commands.solve import solve_command
+from ftdrive.errors import ConfigError
 from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.report import print_comparison, print_result
 from ftdrive.words.result import drift_in_use, drift_in_words, error_in_words, error_source
@@ -231,3 +233,34 @@ def test_a_drift_in_the_fit_is_said_with_what_it_means_for_the_next_use(capsys: 
     assert drift_in_use(followed()) is None
     in_motion = replace(moved, drift=drift, mean_bias=mean_bias, quality={"loo_force_rms_N": 0.01, "worst_pose": 3})
     assert drift_in_use(in_motion) is None
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--level-deg", "-1", "-1.0 is not in the range 0<=x<=180"),
+        ("--mounting-deg", "nan,0,0", "--mounting-deg is 'nan,0,0': give 3 numbers"),
+        ("--mass-kg", "0", "0.0 is not in the range x>0"),
+        ("--up", "0,0,0", "--up is 0,0,0, which is not a direction: give 0,0,1"),
+    ],
+)
+def test_an_impossible_known_value_is_reported_as_it_was_given(
+    option: str, value: str, words: str, tmp_path: Path
+) -> None:
+    tilted().save(tmp_path / "data.json")
+    with pytest.raises((click.UsageError, ConfigError)) as error:
+        solve_command.main([str(tmp_path / "data.json"), option, value], standalone_mode=False)
+    assert words in str(error.value)
+
+
+def test_the_truth_stands_beside_with_the_error_in_sigmas(capsys: pytest.CaptureFixture[str]) -> None:
+    truth = followed().to_dict() | {
+        "mass_kg": 2.0 - 3 * followed().sigma["mass_kg"],
+        "force_bias_N": [0.995, -2.0, 0.0],
+    }
+    print_result(followed(), truth=truth)
+    out = capsys.readouterr().out
+    rows = rows_of(out)
+    assert rows["mass, kg"][-1] == "+3.0"
+    assert rows["force bias x, N"] == ["0.9950", "1.0000", "0.0010", "+5.0"]
+    assert "truth: a free tool reads 0.0050 N, 0.00000 N·m rms; before 19.7 N, 0.96 N·m" in out

@@ -3,7 +3,7 @@
 import json
 import time
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from ftdrive.stream.weighing import ScaleState
 from ftdrive.view.live_page import LivePage, WeighPage
 from ftdrive.view.page import Page, drawing
 from ftdrive.words.stream import StreamSummary
+from tests.unit.ftdrive.stream.simulated import calibrated, dwells, info, paired, replayed
 from tests.unit.ftdrive.terminal.fake_stream import INFO, R_BASE_FLANGE, R_FLANGE_SENSOR, FakeStream, SteppedFeed
 from tests.unit.ftdrive.terminal.test_weigh_screen import NOTHING, PART, FakeWeighing
 
@@ -222,3 +223,32 @@ def test_a_viewer_zeroes_the_scale_only_if_that_is_allowed() -> None:
     _, page, weighing = weighed(ScaleState(PART, None), controls=True)
     page.act("viewer 2", "zero", None)
     assert weighing.is_zeroing
+
+
+def test_a_viewer_of_a_replay_pauses_and_goes_elsewhere() -> None:
+    rows = paired(dwells(1, 3000, seed=1))
+    stream = replayed(info(calibrated()), rows, speed=3.0)
+    replay, shown = cast("Any", stream.source), Shown(stream)
+    parts = shown.run()
+    assert (control(parts, "play")["label"], control(parts, "speed")["value"]) == ("Pause", "3")
+    shown.act("play")
+    shown.act("seek", 2)
+    shown.act("speed", "4")
+    assert replay.is_paused
+    assert replay.at_s == pytest.approx(2.0, abs=0.02)
+    assert replay.speed == 4.0
+    parts = shown.run(0)
+    assert (control(parts, "play")["label"], control(parts, "speed")["value"]) == ("Play", "4")
+    assert control(parts, "seek")["value"] == pytest.approx(replay.at_s, abs=0.1)
+    assert control(parts, "seek")["text"] == f"{replay.at_s:.1f} of 3.0 s"
+    shown.act("play")
+    assert not replay.is_paused
+    replay.seek(replay.duration_s)
+    stream.read()
+    assert control(shown.run(0), "play")["label"] == "Play"
+    shown.act("play")
+    assert replay.at_s == pytest.approx(0.0, abs=0.02)
+    with pytest.raises(ValueError, match="cannot have this value"):
+        shown.act("seek", 3.5)
+    assert {"axes", "about"} <= {*names_of(parts)}
+    assert "tare" not in names_of(parts)
