@@ -35,21 +35,6 @@ def write_user_file(text: str) -> None:
     (user_folder("config") / "ftdrive.toml").write_text(text)
 
 
-def test_defaults_fill_what_is_not_said(tmp_path: Path) -> None:
-    path = tmp_path / "cell.toml"
-    path.write_text(GOOD + "[sampling]\naverage_s = 1\n")
-    found = load(path)
-    assert (found.robot.host, found.sensor.sign, found.sampling.average_s, found.site.g_m_s2) == (
-        "10.0.0.2",
-        1,
-        1,
-        9.80665,
-    )
-    assert (found.robot.speed_deg_s, found.robot.acceleration_deg_s2, found.robot.tip_speed_mm_s) == (60, 80, 250)
-    assert found.sensor.height_mm is None
-    assert found.workcell.measured is False
-
-
 def test_every_section_reaches_the_cell(tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_text(
@@ -151,22 +136,6 @@ def test_a_variable_that_cannot_be_used_is_named(
     with pytest.raises(ConfigError) as error:
         settings()
     assert all(word in str(error.value) for word in words), error.value
-
-
-@pytest.mark.parametrize(
-    ("line", "cure"),
-    [
-        ("[site]\ng_m_s2 = '9.81'", "a number: give one such as"),
-        ("[sampling]\nattempts = 1.5", "a whole number: give one such as 1,"),
-        ("[workcell]\nmounting = true", "a string: put it in quotes"),
-        ("[workcell]\nmeasured = 1", "true or false: give one of them"),
-        ("[tool]\ncylinders_mm = [0, 60, 90]", r"such as \[\[0, 60, 90\]\]"),
-    ],
-)
-def test_a_wrong_type_says_what_to_give(line: str, cure: str) -> None:
-    Path("ftdrive.toml").write_text(f"{GOOD}{line}\n")
-    with pytest.raises(ConfigError, match=cure):
-        load()
 
 
 @pytest.mark.parametrize(

@@ -40,13 +40,6 @@ def running(cell: CellClock) -> Iterator[None]:
     thread.join()
 
 
-def test_it_shows_the_time_of_the_cell_and_nothing_else(cell: CellClock, clock: EmulatedClock) -> None:
-    shown = cell.now_ns()
-    time.sleep(0.02)
-    assert clock.now_ns() == shown
-    assert cell.now_ns() > shown
-
-
 def test_the_cell_waits_for_a_thread_that_keeps_up(cell: CellClock, clock: EmulatedClock) -> None:
     with clock.keeping_up():
         seen = clock.now_ns()

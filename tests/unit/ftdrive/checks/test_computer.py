@@ -72,13 +72,6 @@ def test_a_system_without_device_files_is_not_a_failure(tmp_path: Path) -> None:
     assert found.state == "skipped"
 
 
-def test_a_port_that_is_not_there(computer: Path) -> None:
-    (missing,) = port_checks(computer, "ttyACM9").values()
-    assert missing.state == "failed"
-    assert "ttyACM9" in missing.found
-    assert "ftdrive devices" in str(missing.fix)
-
-
 @pytest.mark.parametrize(
     ("group", "mode", "fix"),
     [("uucp", 0o660, "sudo usermod -aG uucp $USER"), ("root", 0o600, 'KERNEL=="ttyUSB[0-9]*", GROUP="dialout"')],

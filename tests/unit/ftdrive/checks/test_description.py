@@ -6,7 +6,7 @@ import pytest
 
 from ftdrive.cell.config import settings
 from ftdrive.checks import description
-from ftdrive.checks.description import BOXES, BY_KEY, MODEL, QUESTIONS, ROBOT, TOOL, WALLS, Description, saved_at
+from ftdrive.checks.description import BY_KEY, MODEL, QUESTIONS, ROBOT, TOOL, WALLS, Description, saved_at
 from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL
 
@@ -25,15 +25,6 @@ def described() -> Description:
     made = Description(REAL, {key: setting.value for key, setting in settings().items()})
     made.texts = {key: list(texts) for key, texts in ANSWERS.items()}
     return made
-
-
-def test_what_is_left_open_has_its_usual_value(described: Description) -> None:
-    cell = described.cell()
-    assert (cell.sensor.height_mm, cell.sensor.mass_kg, cell.tool.name) == (33, None, "tool")
-    assert (cell.workcell.mounting, cell.robot.speed_deg_s, cell.workcell.boxes_mm) == ("floor", 60, ())
-    assert cell.workcell.planes_mm == ((-1, 0, 0, -800), (0.6, 0, 0.8, -400))
-    described.texts |= {"sensor.mass_kg": ["unknown"], BOXES: ["none"]}
-    assert described.cell() == cell
 
 
 @pytest.mark.parametrize("key", [ROBOT, MODEL, "sensor.url", "sensor.height_mm", TOOL])

@@ -85,15 +85,6 @@ def arm_checks(status: ArmStatus, tool: ToolConfig = TOOL, sensor_kg: float | No
     return {check.name: check for check in checks}
 
 
-def test_a_ready_arm() -> None:
-    found = arm_checks(STATUS)
-    assert {check.state for check in found.values()} == {"ok"}
-    assert "50 %" in found["robot.speed"].found
-    payload = found["robot.payload"].found
-    assert "1.20 kg" in payload
-    assert "(0, 10, 50) mm" in payload
-
-
 @pytest.mark.parametrize(
     ("different", "name", "state", "words"),
     [

@@ -220,13 +220,6 @@ def test_a_target_without_bias_says_so(name: str) -> None:
     assert any("bias" in note for note in made.notes)
 
 
-@pytest.mark.parametrize("name", ["franka", "ur-payload", "xarm"])
-def test_a_formula_that_is_not_public_is_called_so(name: str) -> None:
-    rng = np.random.default_rng(0)
-    made = export_calibration(arbitrary(rng, FORMATS[name].expresses), name, settings_of(rng))
-    assert any("not public" in note for note in made.notes)
-
-
 @pytest.mark.parametrize(("base_frame", "flange_frame"), FRAMES)
 def test_the_note_turns_the_sensor_of_the_robot_model(base_frame: str, flange_frame: str) -> None:
     rng = np.random.default_rng(2)

@@ -4,7 +4,7 @@ from datetime import timedelta
 
 import numpy as np
 
-from ftdrive.fleet.state import attention, summary, times_in_words
+from ftdrive.fleet.state import times_in_words
 from ftdrive.fleet.status import fleet_state
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.fleet.fleet_records import NOW, cell, check, daily, fleet, result, time, weighed
@@ -48,21 +48,6 @@ def test_a_calibration_of_an_emulated_cell_is_marked() -> None:
     assert [one.to_dict(NOW)["emulated"] for one in states] == [False, True, True, False, False]
 
 
-def test_a_configured_tool_that_was_never_calibrated_needs_attention() -> None:
-    found = fleet([cell("a", tool="drill"), cell("b"), cell("c", tool=None)], [result("a", 3), result("b", 3)])
-    assert [(one.cell, one.tool, one.calibration_id) for one in found.cells] == [
-        ("a", "drill", None),
-        ("a", "gripper", "a-3"),
-        ("b", "gripper", "b-3"),
-        ("c", None, None),
-    ]
-    assert summary(found, NOW) == "3 cells: 2 never calibrated"
-    assert attention(found, NOW) == [
-        "a, drill: never calibrated: run `ftdrive calibrate` at this cell",
-        "c: never calibrated: run `ftdrive calibrate` at this cell",
-    ]
-
-
 def test_a_tool_out_of_use_is_not_listed_for_ever() -> None:
     results = [
         result("a", 200),
@@ -72,16 +57,6 @@ def test_a_tool_out_of_use_is_not_listed_for_ever() -> None:
     ]
     one = fleet([cell("a")], results, [check(results[2], 3)])
     assert [state.tool for state in one.cells] == ["gripper", "new", "older"]  # configured, newest, verified
-
-
-def test_due_counts_from_the_last_verification_whatever_its_outcome() -> None:
-    made = result("a", 30)
-    cells = [cell("a", verify_every_days=10.0)]
-    (one,) = fleet(cells, [made]).cells
-    assert (one.verified, one.passed, one.due) == (None, None, NOW - timedelta(days=20))
-    (one,) = fleet(cells, [made], [check(made, 12), check(made, 4, passed=False, temperature_C=31.0)]).cells
-    assert (one.verified, one.passed, one.change) == (NOW - timedelta(days=4), False, "bias")
-    assert (one.due, one.is_due(NOW), one.temperature_C) == (NOW + timedelta(days=6), False, 31.0)
 
 
 def test_a_verification_of_an_earlier_calibration_does_not_count() -> None:

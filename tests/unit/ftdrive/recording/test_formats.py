@@ -155,23 +155,6 @@ def test_rosbags_reads_the_messages(paths: Sequence[Path]) -> None:
         assert [one.child_frame_id for one in message.transforms] == ["flange", "sensor", "tcp", named]
 
 
-def test_mcap_ros2_reads_the_messages(paths: Sequence[Path]) -> None:
-    rows = load_recording(paths[0]).rows
-    with paths[0].open("rb") as file:
-        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        attachments = {one.name: one for one in reader.iter_attachments()}
-        summary = reader.get_summary()
-        first_ns = int(rows["t_host_ns"][1400]) + UTC_OFFSET_NS
-        found = list(reader.iter_decoded_messages(["/ft_compensated"], starting_at=first_ns, log_time_order=True))
-    assert attachments.keys() == {"calibration.json", "recording.json"}
-    assert json.loads(attachments["calibration.json"].data) == info().calibration.to_dict()
-    assert summary is not None
-    assert summary.statistics is not None
-    assert summary.statistics.message_start_time == rows["t_host_ns"][0] + UTC_OFFSET_NS
-    assert len(summary.chunk_indexes) == 11  # fifths of a second; the new frame ends one early
-    assert [decoded.wrench.force.x for *_, decoded in found] == rows["wrench"][1400:, 0].tolist()
-
-
 def test_a_weighing_is_an_event_and_a_message(tmp_path: Path) -> None:
     values = {"mass_kg": 1.25, "mass_sigma_kg": 0.0005, "p_sensor_com_m": None, "p_sensor_com_sigma_m": None}
     recorder = Recorder([tmp_path / "a.mcap"], info(), CONFIGURATION)

@@ -10,8 +10,7 @@ import pytest
 
 from ftcalib.errors import BadDataset
 from ftdrive.recording.replay import source_of_run
-from ftdrive.stream.processing import Processor
-from ftdrive.stream.samples import Stages, WrenchFrame
+from ftdrive.stream.samples import WrenchFrame
 from ftdrive.stream.sources import RecordingSource
 from ftdrive.stream.stream import Stream
 from tests.fake_clock import FakeClock
@@ -42,17 +41,6 @@ def test_speed_scales_the_time(speed: float) -> None:
     begin_s = clock.now_s()
     assert sum(1 for _ in stream) == 800
     assert clock.now_s() - begin_s == pytest.approx(0.8 / speed, rel=0.05)
-
-
-def test_it_can_run_as_fast_as_it_is_read() -> None:
-    stream, _, clock = replayed(1.0, speed=math.inf, frame=WrenchFrame("base"), stages=Stages(lowpass_Hz=50.0))
-    begin_s, blocks = clock.now_s(), []
-    while not stream.has_ended:
-        blocks.append(stream.read())
-    assert clock.now_s() == begin_s
-    processor = Processor(info(calibrated()), WrenchFrame("base"), Stages(lowpass_Hz=50.0))
-    whole = processor.process(paired(dwells(1, 1000, seed=1)))
-    np.testing.assert_allclose(np.concatenate([block.wrench for block in blocks]), whole.wrench, atol=1e-12)
 
 
 def test_pause_step_seek_and_resume() -> None:

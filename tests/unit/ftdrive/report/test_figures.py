@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgba
 
 from ftcalib.model import PARAMETER_NAMES, Array
-from ftdrive.report.figures import BAD, MOST_DOTS, SERIES, WIDTH_IN, draw_figure
+from ftdrive.report.figures import MOST_DOTS, SERIES, WIDTH_IN, draw_figure
 from ftdrivers.sweep import Sweep
 
 Draw = Callable[[str, Mapping[str, Any]], Any]
@@ -61,15 +61,6 @@ def names_at(axes: Any) -> list[str]:
 def levels(axes: Any) -> list[float]:
     """Heights of the lines across the whole figure."""
     return [float(line.get_ydata()[0]) for line in axes.lines if len(line.get_xdata()) == 2]
-
-
-def test_a_bar_is_the_residual_of_its_pose_in_sigma(drawn: Draw) -> None:
-    (axes,) = drawn("pose_residuals", {"poses": POSES}).axes
-    assert [bar.get_height() for bar in axes.patches] == [0.5 * row for row in range(1, 9)]
-    assert [bar.get_hatch() for bar in axes.patches] == [None, None, "///", *[None] * 5]
-    assert [to_hex(bar.get_facecolor()) == BAD for bar in axes.patches] == [row == 3 for row in range(1, 9)]
-    assert levels(axes) == [1, 1.9]
-    assert names_at(axes) == [f"R{100 + row}" for row in range(1, 9)]
 
 
 def test_of_many_poses_every_so_many_is_named(drawn: Draw) -> None:

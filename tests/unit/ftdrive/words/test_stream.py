@@ -34,16 +34,6 @@ def reading_of(view: View) -> ShownWrench:
     return view.reading
 
 
-def test_numbers_are_the_mean_of_the_last_tenth_of_a_second() -> None:
-    rig = Rig(FakeStream("contact"))
-    rig.run(23)
-    last, _ = rig.feed.subscribe()
-    rig.feed.step(10)
-    view = rig.summary.view()
-    np.testing.assert_allclose(reading_of(view).wrench, np.concatenate([block.wrench for block in last]).mean(axis=0))
-    np.testing.assert_allclose(reading_of(view).raw, np.concatenate([block.raw for block in last]).mean(axis=0))
-
-
 def test_a_recording_that_goes_back_between_two_drawings_leaves_nothing_in_the_mean() -> None:
     rig = Rig(FakeStream("contact", block_s=0.05))
     rig.feed.step(240)  # in contact, with 5 N
@@ -51,17 +41,6 @@ def test_a_recording_that_goes_back_between_two_drawings_leaves_nothing_in_the_m
     reading = reading_of(rig.run(1))
     assert not reading.in_contact
     assert np.abs(reading.wrench).max() < SIGMA[0]
-
-
-def test_the_result_does_not_depend_on_when_it_is_drawn() -> None:
-    often, seldom = (Rig(FakeStream("contact", block_s=0.05)) for _ in range(2))
-    for _ in range(80):
-        often.run(3)
-    a, b = often.run(1), seldom.run(241)
-    np.testing.assert_allclose(reading_of(a).wrench, reading_of(b).wrench)
-    np.testing.assert_array_equal(a.peaks.low, b.peaks.low)
-    np.testing.assert_array_equal(a.columns(100).high, b.columns(100).high)
-    assert a.contact_s == pytest.approx(b.contact_s)
 
 
 def test_peaks_are_of_single_samples_until_they_are_reset() -> None:
