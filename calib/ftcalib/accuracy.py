@@ -61,7 +61,7 @@ def orientations(elevation_rad: Array, azimuth_rad: Array) -> Array:
 
 
 def tip_of(result: CalibrationResult) -> Array:
-    """Return the tip of the tool (3,) from the sensor origin in sensor axes, m.
+    """Return the position (3,) of the tool tip relative to the sensor origin, in sensor axes, m.
 
     It is the far end of the described cylinders, by default 200 mm from the flange.
     """

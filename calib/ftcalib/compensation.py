@@ -37,7 +37,7 @@ class Compensator:
     response : Response, optional
         Gain and cross-talk of the sensor for the weight of the tool.
     decoder : array, shape (6, 6), optional
-        Converts readings minus free tool to contact wrenches: `ftcalib.sensor_matrix.ContactResponse.decoder`.
+        Converts readings minus the free-tool wrench to contact wrenches, see `ContactResponse.decoder`.
 
     Attributes
     ----------
@@ -195,7 +195,7 @@ def motion_of_poses(
 ) -> SensorMotion:
     """Return velocities and accelerations of poses, from a quadratic fit to the neighbours of each pose.
 
-    The fit is to position and rotation vector of the neighbours, relative to the pose.
+    The position and the rotation vector of the neighbours relative to the pose are fitted.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ class Summary(NamedTuple):
 
 
 class Displayed:
-    """Base of objects that print as a short summary and show a table in a notebook.
+    """Base class of objects that print as a short summary and show a table in a notebook.
 
     A dataclass that inherits from this class needs ``repr=False``. The summary lists its fields, arrays by their shape.
     """

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class FtdriveError(Exception):
-    """Base of all errors of ftdrive that a user can fix; the message says what happened and what to do.
+    """Base class of all errors of ftdrive that a user can fix; the message says what happened and what to do.
 
     A file that is missing or cannot be written raises Python's `OSError` instead.
 

@@ -106,7 +106,7 @@ def open_file(path: str | Path) -> BufferedReader:
 
 
 def read_file(path: str | Path) -> bytes:
-    """Return the content of a file; raise `OSError` like `open_file`, and for a file above 200 MB."""
+    """Return the content of a file; raise `OSError` as `open_file` does, and for a file larger than 200 MB."""
     with open_file(path) as file:
         if (size := os.fstat(file.fileno()).st_size) > MOST_BYTES:
             raise OSError(
@@ -117,7 +117,7 @@ def read_file(path: str | Path) -> bytes:
 
 
 def read_lines(file: BufferedReader, error: type[Exception], first: int = 1) -> Iterator[bytes]:
-    """Yield the remaining lines of a file with their line ends; raise `error` for a line above 16 MB.
+    """Yield the remaining lines of a file with their line ends; raise `error` for a line longer than 16 MB.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def parsed_json(text: str | bytes) -> JSON:
 def write_object(
     path: str | Path, document: Mapping[str, JSON], *, indent: int | None = 1, allow_nan: bool = False
 ) -> None:
-    """Write a new JSON file with a checksum. Raises like `write_new`."""
+    """Write a new JSON file with a checksum. Raises whatever `write_new` raises."""
     write_new(path, object_text(document, indent=indent, allow_nan=allow_nan))
 
 
@@ -157,7 +157,7 @@ def object_text(document: Mapping[str, JSON], *, indent: int | None = 1, allow_n
 
 
 def read_object(path: str | Path, error: type[Exception], *, accept_changed: bool = False) -> dict[str, Any]:
-    """Return the object in a JSON file; raise `error` like `object_of`, or `OSError`."""
+    """Return the object in a JSON file; raise `error` as `object_of` does, or `OSError`."""
     return object_of(read_file(path), error, accept_changed=accept_changed)
 
 

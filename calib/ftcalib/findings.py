@@ -107,7 +107,7 @@ class Finding(Displayed):
 
     @property
     def words(self) -> str:
-        """Sentence with problem and remedy."""
+        """Sentence with the problem and its remedy."""
         return f"{self.found}: {self.fix}" if self.fix else self.found
 
     def _summary(self) -> Summary:

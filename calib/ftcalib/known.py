@@ -33,7 +33,7 @@ class Known:
     R_flange_sensor: ArrayLike | None = None
     """(3, 3) mounting of the sensor; with `yaw_only` up to a rotation about flange z, by default the identity."""
     R_tolerance_rad: float = 0.0
-    """Tolerance of each rotation angle of the mounting, rad; with `yaw_only` of the two tilts."""
+    """Tolerance of each rotation angle of the mounting, rad; with `yaw_only`, of the two tilts."""
     yaw_only: bool = False
     """Whether the sensor is mounted flat, so only its rotation about the flange z axis is unknown."""
     gravity_direction_base: ArrayLike | None = None

@@ -35,7 +35,7 @@ from ftcalib.rounding import counted
 from ftcalib.sensor_matrix import SIZE, SQUARES, Calibrated, ContactResponse, Response, SensorMatrix
 from ftcalib.shown import ShownEstimate, data_frame, shown_estimates, summary_rows, wrench_figure
 
-# Number of sigmas of the sensor's gain from which weighed and estimated mass contradict each other.
+# Number of sigmas of the sensor's gain above which the weighed and the estimated mass contradict each other.
 _CONTRADICTS = 4.0
 
 # Smallest eigenvalue of a correlation matrix that can be a rounding error.
@@ -79,7 +79,7 @@ class MotionResult(Displayed):
     covariance: Array
     """(23, 23) covariance of the 15 error coordinates, ixx, iyy, izz, ixy, ixz, iyz, height and delay."""
     used_share: float
-    """Share of the recording that was used. The rest was contact, gaps, or too fast to use without positions."""
+    """Share of the recording that was used. The rest was contact, a gap, or too fast to use without positions."""
     contacts: tuple[Mapping[str, float], ...] = ()
     """Contacts: time `t_s` after the first sample, `duration_s`, and filtered peaks `force_N` and `torque_Nm`."""
 
@@ -498,7 +498,7 @@ class CalibrationResult(Displayed, Calibrated):
         return shown_estimates({**values, "sigma": sigma, "covariance": self.covariance})
 
     def to_frame(self) -> Any:
-        """Return the estimates as a DataFrame of pandas, or of Polars if pandas is not installed.
+        """Return the estimates as a pandas DataFrame, or as a Polars one if pandas is not installed.
 
         Returns
         -------

@@ -21,7 +21,7 @@ from ftcalib.sampling import Sampling
 
 
 class WrenchSamples(Protocol):
-    """n samples of a force/torque sensor, as measured: before any bias, tare, filter or compensation."""
+    """n samples from a force/torque sensor, as measured: before any bias, tare, filter or compensation."""
 
     @property
     def t_host_ns(self) -> NDArray[np.int64]:
@@ -98,7 +98,7 @@ class TourPose:
     """One stop of a tour."""
 
     number: int
-    """Number of the orientation: 1 to 24 as in Yu et al., Fig. 3; above 100 for all others."""
+    """Orientation number: 1 to 24 as in Yu et al., Fig. 3; above 100 for all others."""
     q_rad: Array
     """(6,) joint angles, rad."""
 
@@ -114,7 +114,7 @@ class PoseRecord:
     after: ArmReading
     samples: WrenchSamples
     steady: bool
-    """Whether neither flange nor mean wrench changed during the dwell."""
+    """Whether neither the flange nor the mean wrench changed during the dwell."""
     attempts: int = 1
     """Number of dwells at this pose, including this one."""
     clock_offset_ns: int = 0
@@ -162,7 +162,7 @@ def take_pose(  # noqa: PLR0913 - the limits for a steady pose
     quiet_std: Array | None = None,
     most_swing_N: float | None = None,
 ) -> PoseRecord:
-    """Wait until the arm is at rest, then average; repeat if arm or wrench changed during the dwell.
+    """Wait until the arm is at rest, then average; repeat if the arm or the wrench changed during the dwell.
 
     Parameters
     ----------

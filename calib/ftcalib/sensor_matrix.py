@@ -7,7 +7,7 @@ from force to torque,
 
     force_N = (1 + force_gain) u + force_bias_N        torque_Nm = p x u + cross_talk_m u + torque_bias_Nm
 
-with u the weight in the sensor frame. Both matrices are symmetric, and the gain has trace zero: together with mounting,
+with u the weight in the sensor frame. Both matrices are symmetric, and the gain has zero trace: together with mounting,
 weight and centre of mass they describe every linear response to one payload. A gain common to all axes cannot be
 separated from the weight. Gain and cross-talk are eleven of the 36 numbers (`Response`). Three others are a rotation d
 of the sensor, and three a shift of the centre of mass; both are part of the tool's estimates. In the axes of the
@@ -19,7 +19,7 @@ so the error of the decoded contact is linear in the error of E. Entries of E th
 weighed tool shows one more number: the gain common to all axes at its centre of mass.
 
 The errors of E and of the mounting are correlated. The mounting of a separate calibration has its own noise and the d
-of the present E. If its poses are among those of the runs with loads, the joint fit contains the correlation.
+of the current E. If its poses are among those of the runs with loads, the joint fit contains the correlation.
 """
 
 from collections.abc import Mapping
@@ -510,14 +510,14 @@ class ContactResponse:
 
     @cached_property
     def decoder(self) -> Array | None:
-        """(6, 6) matrix that converts reading minus free tool to the contact wrench; None if it is the identity."""
+        """(6, 6) matrix from a reading minus the free-tool wrench to the contact wrench; None if it is the identity."""
         if not self.error.any():
             return None
         turn = skew(_mounting_turn(self.error, self.parameters.p_sensor_com_m))
         return read_only(np.linalg.inv(np.eye(6) + self.error - np.kron(np.eye(2), turn)))
 
     def decode(self, contact: Array) -> Array:
-        """Return decoded contact wrenches (..., 6) from readings minus free tool (..., 6)."""
+        """Return decoded contact wrenches (..., 6) from readings minus the free-tool wrench (..., 6)."""
         return contact if self.decoder is None else np.asarray(contact @ self.decoder.T)
 
     def error_columns(self, wrench: Array) -> Array:

@@ -100,7 +100,7 @@ def summary_rows(estimates: Iterable[ShownEstimate]) -> list[Row]:
 
 
 def data_frame(columns: Mapping[str, ArrayLike]) -> Any:
-    """Return named columns as a DataFrame of pandas, or of Polars if pandas is not installed.
+    """Return named columns as a pandas DataFrame, or as a Polars one if pandas is not installed.
 
     Raises
     ------

@@ -241,7 +241,7 @@ def _judge(case: Case, measured_sigma: Array | None) -> Quality:
 def _find_change(case: Case, quality: Quality, measured_sigma: Array | None) -> list[Finding]:
     """Return the finding of a change during the session, if one explains the data better than the fit.
 
-    It is searched only if the fit has components or rejected poses that could hide a change.
+    The search is made only if the fit has components or rejected poses that could hide a change.
     """
     fitted, t_s = case.freest, case.t_s
     kinds = ("walk", "slope") if quality.chi2_p is None else ("walk", "slope", "white")

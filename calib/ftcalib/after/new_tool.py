@@ -3,7 +3,7 @@
 `new_tool` uses mounting, direction of gravity, gain and cross-talk of an earlier result, with their covariance, as a
 prior. Weight, centre of mass and bias have no prior. The misfit of poses and prior tests whether the prior still holds.
 
-`together` combines runs that were solved separately, each with its own bias, by averages weighted by information.
+`together` combines runs that were solved separately, each with its own bias, by information-weighted averaging.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -60,14 +60,14 @@ class CellPrior:
         return len(kept) + len(self.coefficients) * bool(kept)
 
     def rows(self, p: Parameters, coefficients: Array, kept: Sequence[int] = WHOLE) -> tuple[Array, Array]:
-        """Return the derivative (k, 15 or 26) and residual (k,), earlier minus present, in standard deviations.
+        """Return the derivative (k, 15 or 26) and residual (k,), earlier minus current, in standard deviations.
 
         Parameters
         ----------
         p : Parameters
-            Present parameters.
+            Current parameters.
         coefficients : array, shape (11,) or (0,)
-            Present coefficients of gain and cross-talk.
+            Current coefficients of gain and cross-talk.
         kept : sequence of int
             Rows of the prior that are used: 0 to 2 for the mounting, 3 and 4 for the base. Gain and cross-talk are
             always used, unless `kept` is empty.
@@ -96,7 +96,7 @@ class CellPrior:
         Parameters
         ----------
         chi2, dof : float, int
-            Misfit with the whole prior.
+            Misfit with the whole prior, and its degrees of freedom.
         refit : callable
             Function that fits with a part of the prior. May raise `NotObservable`.
         data, alone : str
@@ -188,7 +188,7 @@ def new_tool(
             break
     if changed:
         raise NotObservable(changed)
-    # Components that belong to arm and sensor are kept, but not those of one session.
+    # Components that belong to the arm and the sensor are kept, but not those of one session.
     kept = {name: value for name, value in earlier.components.items() if name in ("rotation_rad", "hysteresis")}
     result = apply_update(earlier, fitted, {**(provenance or {}), "dataset_sha256": dataset.sha256()})
     return replace(result, quality={}, weights=None, components=kept)
@@ -242,7 +242,7 @@ def _start(old: Parameters, R_base_flange: Array, wrench: Array) -> Parameters:
 
 
 def _beyond(earlier: CalibrationResult, new: Parameters, most: float = LOAD) -> Array:
-    """Return the variance (6,) of a pose beyond its noise, from the residuals of the earlier fit and their uncertainty.
+    """Return the variance (6,) of a pose in excess of its noise, from earlier residuals and their uncertainty.
 
     It is scaled with the third power of the load, up to the share `most` of the load.
     """

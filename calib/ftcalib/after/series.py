@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ftcalib.model import Array, Parameters, read_only
 
-# Difference of two calibrations in standard deviations, and its joint test.
+# Difference between two calibrations in standard deviations, and its joint test.
 
 # A standard deviation below this share of the largest is a rounding error: the value was exactly known.
 _KNOWN = 1e-9
@@ -44,7 +44,7 @@ class ChiSquare:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Difference:
-    """Difference of two calibrations: the second minus the first."""
+    """Difference between two calibrations: the second minus the first."""
 
     change: Array
     """(15,) difference in the error coordinates `ftcalib.model.PARAMETER_NAMES`; rotation about flange axes, rad."""
@@ -63,7 +63,7 @@ class Difference:
 
 
 def calibration_difference(first: EstimatedParameters, second: EstimatedParameters) -> Difference:
-    """Return the difference of two calibrations whose errors are independent.
+    """Return the difference between two calibrations whose errors are independent.
 
     A field that is identical in both calibrations was copied, for example by an update of the bias. It is left out of
     the joint test, because its error is common. Gain and cross-talk of the sensor are not compared.
@@ -135,7 +135,7 @@ SIGNIFICANT = 1e-5
 LEAST_DAYS = 7.0
 # If the series begins more than this after the calibration, the error of the calibration no longer constrains c.
 _NEAR_DAYS = 14.0
-# Smallest difference of chi2 by which a step fits better than an onset: odds of 20 to 1.
+# Smallest difference in chi2 by which a step fits better than an onset: odds of 20 to 1.
 CLEARLY = 6.0
 
 
@@ -352,7 +352,7 @@ class BiasTemperature:
 
 
 def spans_temperature(temperature_C: Array, fewest: int) -> bool:
-    """Whether a dependence can be estimated: from at least `fewest` runs, over at least 3 K."""
+    """Whether a dependence can be estimated, which takes at least `fewest` runs that span at least 3 K."""
     return len(temperature_C) >= fewest and bool(np.ptp(temperature_C) >= _LEAST_K)
 
 
@@ -372,7 +372,7 @@ def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Ar
     Returns
     -------
     BiasTemperature or None
-        None for fewer than 6 runs, or for runs within 3 K.
+        None for fewer than 6 runs, or for runs that span less than 3 K.
     """
     columns = (t_days, temperature_C, bias, sigma)
     t_days, T, y, sigma = (np.asarray(column, dtype=np.float64)[-_MOST:] for column in columns)

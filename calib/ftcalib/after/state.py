@@ -1,7 +1,7 @@
 """Update or tare of a calibration after a change of bias, payload, mounting or base, from a few new poses.
 
-Parameters that are not estimated keep their values and their uncertainty, which is an error common to all readings. It
-is part of the weights (generalised least squares) and of the covariance of the result.
+Parameters that are not estimated keep their values and their uncertainty. Their errors are common to all readings, and
+are part of the weights (generalised least squares) and of the covariance of the result.
 """
 
 from collections.abc import Mapping, Sequence
@@ -265,7 +265,7 @@ def _invert_information(information: Array, kind: str, n: int) -> Array:
     )
 
 
-# Tare: a new estimate of the biases from a few seconds of a free tool.
+# Tare: a new estimate of the biases from a few seconds of readings of the free tool.
 
 # Share of good tares that are rejected.
 FALSE_ALARMS = 1e-3

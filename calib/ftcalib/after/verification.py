@@ -1,11 +1,11 @@
 """Verification: whether new poses agree with a calibration and, if not, what has changed.
 
 All residuals are tested jointly. Their covariance contains the noise of the readings, the errors of each pose that the
-fit found (`components`), the drift of the bias since then, and the uncertainty of the calibration, common to all poses:
+fit found (`components`), the drift of the bias since the fit, and the uncertainty of the fit, common to all poses:
 
     S = noise + J C J' + drift,    chi2 = r' S^-1 r
 
-The noise model of a fit of few poses is uncertain. Two explanations of its residuals are therefore considered:
+The noise model of a fit to few poses is uncertain. Two explanations of its residuals are therefore considered:
 
 * The components that the fit found (`CalibrationResult.components`), as if the new poses continued the tour.
 * The measured noise times a factor, and usual errors of sensor, arm and cable (`response_columns`,
@@ -64,7 +64,7 @@ _SEVERAL = ("bias and payload", "all")
 _COST = 8.0
 # Smallest p-value of the remaining misfit of a change that explains the readings.
 _UNEXPLAINED = 1e-3
-# Two changes with a smaller difference of chi2 are not distinguished: odds of 100 to 1.
+# Two changes with a smaller difference in chi2 are not distinguished: odds of 100 to 1.
 _INDISTINCT = 9.2
 FEWEST = 2
 
@@ -91,7 +91,7 @@ class Expected:
     """Predictive distribution of the readings of an unchanged cell, under one explanation."""
 
     calibration: Update
-    """Calibration whose covariance includes the drift of the bias since then."""
+    """Calibration whose covariance includes the drift of the bias since it was made."""
     noise: Array
     """(6n, 6n) covariance of the new readings: measured noise, errors of each pose, drift since the first new pose."""
     freedom: float
@@ -203,7 +203,7 @@ def expected_with_smooth_errors(
     found have their estimated variance.
 
     The errors at the new poses are predicted from those of the fit, with a variance that increases with the distance in
-    orientation. A part depends on joint angles alone; a fit of turns of the wrist does not show this part.
+    orientation. A part depends on joint angles alone; a fit to wrist rotations does not show this part.
     """
     p = calibration.parameters
     kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0

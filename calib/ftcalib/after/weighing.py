@@ -9,7 +9,7 @@ readings, the errors of the calibration, which are common to all readings and gr
 of the bias. One pose determines m p only perpendicular to gravity. A prior therefore places the part near a point of
 the gripper, with a standard deviation `REACH_M`, and determines the centre of mass along gravity.
 
-A weight has no force perpendicular to gravity and no torque about gravity. Such readings are a fault: see `Fault`.
+A weight exerts no force perpendicular to gravity and no torque about the vertical. Readings of either are a `Fault`.
 """
 
 from collections.abc import Callable
@@ -42,7 +42,7 @@ from ftcalib.sensor_matrix import (
 REACH_M = 0.1
 # False-alarm probability of the test for a fault.
 FALSE_ALARMS = 1e-5
-# Number of sigmas from which a mass differs from zero.
+# Number of sigmas above which a mass counts as different from zero.
 LEAST_SIGMAS = 4.0
 # Usual drift of a bias, one standard deviation, N/h and N·m/h: warm sensors drift less.
 _DRIFT_PER_H = np.repeat([5.0, 0.15], 3)
@@ -122,7 +122,7 @@ class Weight(Displayed):
 
 
 def drift_since(seconds: float, per_h: Array = _DRIFT_PER_H) -> Array:
-    """Return the standard deviation (6,) of the change of a bias within a time, N and N·m; infinity: never zeroed."""
+    """Return the standard deviation (6,) of the change of a bias over a time, N and N·m; infinity: never zeroed."""
     return np.asarray(np.minimum(per_h * max(seconds, 0.0) / 3600, _USUAL_DRIFT))
 
 
@@ -302,7 +302,7 @@ def true_tool(calibration: CalibrationResult) -> tuple[float, Array]:
 
 
 def _fault(left: Array, A: Array, S: Array, p_value: float, n: int) -> Fault | None:
-    """Return why the readings are not those of one weight: first in each pose alone, then between poses."""
+    """Return why the readings are not those of one weight; each pose is tested alone, then all poses together."""
     parts = [S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)]
     alone = [_misfit(left[k, :3], A[k, :3, :1], part[:3, :3]) for k, part in enumerate(parts)]
     if min(chi2_sf(2, chi2) for chi2 in alone) < FALSE_ALARMS:

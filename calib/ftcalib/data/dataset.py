@@ -153,7 +153,7 @@ class CalibrationDataset(Displayed):
         return Summary(f"Dataset of {counted(len(self), 'pose')}, wrenches as measured, in the sensor frame", rows)
 
     def to_frame(self) -> Any:
-        """Return a DataFrame of pandas, or of Polars if pandas is not installed; `ftdrive.read_dataset` can read it.
+        """Return a pandas DataFrame, or a Polars one if pandas is not installed; `ftdrive.read_dataset` can read it.
 
         Returns
         -------

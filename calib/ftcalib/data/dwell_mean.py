@@ -28,7 +28,7 @@ RESTLESS = 2.0
 SWING_HZ = (0.7, 1.6)
 # Smallest share of the variance of all channels that a swing explains; fits to white noise do not reach it.
 SWING_SHARE = 0.25
-# Number of block means of a dwell in which the frequency of a swing is searched.
+# Number of block means of a dwell that are searched for the frequency of a swing.
 SWING_BLOCKS = 200
 
 # Largest rounding error, relative to the largest value.

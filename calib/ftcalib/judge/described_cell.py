@@ -1,4 +1,4 @@
-"""Contradictions to known values or to the described cell: signs, mounting, payload, mass and centre of mass."""
+"""Contradictions with known values or with the described cell: signs, mounting, payload, mass and centre of mass."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -182,7 +182,7 @@ def payload(
 
 
 def tool(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float) -> list[Finding]:
-    """Return findings if mass or centre of mass contradict the described tool."""
+    """Return findings if the mass or the centre of mass contradicts the described tool."""
     return [*_mass_findings(parameters, covariance, setup, g_m_s2), *_centre_of_mass(parameters, covariance, setup)]
 
 
@@ -245,7 +245,7 @@ def _outside_m(parameters: Parameters, covariance: Array, setup: Setup) -> float
     """Return the significant distance of the centre of mass outside the described cylinders; negative inside.
 
     A body's centre of mass lies in its convex hull. The distance from the hull is the maximum over all directions of
-    the extent of the point minus that of the hull, less a multiple of sigma. An unknown height may be any.
+    the extent of the point minus that of the hull, less a multiple of sigma. An unknown height may have any value.
     """
     height_m = setup.sensor_height_m
     lowest_m, highest_m = (0.0, max(row[1] for row in setup.cylinders_m)) if height_m is None else (height_m,) * 2

@@ -38,8 +38,8 @@ CORRECTED = 0.1
 IMPLAUSIBLE = 1.0
 # Residuals that differ by a smaller factor are considered equal, and the simpler explanation is preferred.
 TIED = 1.3
-# Wrenches of a weight in other poses: force residual from which poses are suspected, and from which they are taken for
-# other poses rather than inaccurate ones, as shares of the weight; largest radial share of the residual.
+# Force residuals, as shares of the weight, above which the poses are suspected, and above which they are taken for
+# other poses rather than inaccurate ones. Largest radial share of the residual if the wrenches are those of a weight.
 OFF_POSES, OTHER_POSES, OF_A_WEIGHT = 0.015, 0.15, 0.1
 # A force that is constant in base axes counts as a weight within this angle of straight down.
 IN_BASE_RAD = np.deg2rad(10.0)
@@ -54,7 +54,7 @@ UNEQUAL = 0.05
 # Probability, per reading, of a larger deviation from the prediction by chance.
 BY_CHANCE = 1e-6
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
-# Number of poses in which steps of the readings are searched.
+# Number of poses that are searched for steps of the readings.
 FOR_STEPS = 1000
 # Smallest number of different readings that shows steps: a weight along the axes alone reads -weight, 0 and +weight.
 FEWEST_STEPS = 4
@@ -163,7 +163,7 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
 
 
 def other_poses(R_base_flange: Array, wrench: Array) -> list[Finding]:
-    """Return a finding for wrenches of a weight in other poses: forces on a sphere, with matching torques.
+    """Return a finding for wrenches that a weight exerts in other poses: forces on a sphere, with matching torques.
 
     The sphere does not depend on the orientations, so this detects wrong orders or forms that `faults` cannot correct.
     """
@@ -294,7 +294,7 @@ def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
     findings = [Finding.of("stuck_channels", channels=stuck)] if stuck else []
     coarse = [_coarse_step(part[:FOR_STEPS]) for part in np.hsplit(wrench, 2)]
     if any(coarse):
-        # Coarse steps cause equal readings, so copies and saturation are not searched.
+        # Coarse steps cause equal readings, so the data are not searched for copies and saturation.
         return [*findings, Finding.of("quantised", step_N=coarse[0], step_Nm=coarse[1])]
     distinct = len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench)
     copied = [] if distinct else _copies(wrench)

@@ -157,7 +157,7 @@ def second_minimum(R_base_flange: Array, parameters: Parameters = NOMINAL) -> tu
     """Return the gap to the best solution with another mounting, and that solution; infinity and None without one.
 
     The gap is the mean squared force residual over the squared weight, from forces without noise, because torques
-    rarely decide. With force noise sigma, chi2 of the wrong solution of n poses is larger by n (weight / sigma)² gap.
+    rarely decide. With force noise sigma, chi2 of the wrong solution for n poses is larger by n (weight / sigma)² gap.
     """
     force_N = gravity_wrench(parameters, R_base_flange)[:, :3]
     mountings = minima(force_cost(R_base_flange, force_N, np.ones(len(force_N))))
@@ -203,7 +203,7 @@ def _nearby(
 
 
 def _is_sound(R_base_flange: Array, parameters: Parameters) -> bool:
-    """Whether a set of poses is sound; the second solution, which takes longest, is searched only if necessary."""
+    """Whether a set of poses is sound; the second solution, which takes longest, is sought only if necessary."""
     observability = _nearby(R_base_flange, parameters)[0]
     return observability.sound and _with_second_gap(observability, R_base_flange, parameters).sound
 
@@ -345,7 +345,7 @@ def _advice(R_base_flange: Array, parameters: Parameters) -> tuple[tuple[str, ..
 
 
 def _worth(R_base_flange: Array, parameters: Parameters) -> float:
-    """Return a score of the information volume and of the spread of gravity directions out of a plane.
+    """Return a score from the information volume and the spread of gravity directions out of a plane.
 
     Gravity directions in one plane have a second solution.
     """

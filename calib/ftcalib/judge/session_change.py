@@ -89,7 +89,7 @@ class SessionChange:
     misfit: float
     """Mean square residual after the correction, relative to the noise."""
     criterion: float
-    """BIC of the change among other kinds of change."""
+    """BIC, by which different kinds of change are compared."""
 
     @property
     def takes_turns(self) -> bool:
@@ -118,7 +118,7 @@ class SessionChange:
             code = "sensor_turned"
         if self.takes_turns:
             code = "sensors_alternate"
-        elif code == "bias_stepped" or not (weights[rows[: self.starts[0]]] > 0.5).any():  # the present load was fitted
+        elif code == "bias_stepped" or not (weights[rows[: self.starts[0]]] > 0.5).any():  # the current load was fitted
             severity = "limit"
         needed = CODES[code].values
         return Finding.of(code, severity, **{name: value for name, value in values.items() if name in needed})
@@ -133,7 +133,7 @@ def possible_changes(found: Fit, t_s: Array, *, steps: bool) -> tuple[NDArray[np
         Fit without known values.
     t_s : array, shape (n,)
     steps : bool
-        Whether to search steps of the bias, which look like a drift.
+        Whether to search for steps of the bias, which look like a drift.
 
     Returns
     -------
@@ -427,7 +427,7 @@ def cable_of(fit: Fit) -> tuple[Finding, Array] | None:
     chi2 = float(np.vdot(r, u))
 
     def best_of(slack: Array) -> tuple[float, Array, Array, Array]:
-        """Return the best slack orientation of (k, 3, 3): reduction of chi2, orientation, torques, parameter shift."""
+        """Return the best of slack orientations (k, 3, 3): reduction of chi2, orientation, torques, parameter shift."""
         k = len(slack)
         v = Rotation.from_matrix((np.swapaxes(slack, 1, 2)[:, None] @ R).reshape(-1, 3, 3)).as_rotvec()
         each = np.zeros((n, 6, k, 3, 3))

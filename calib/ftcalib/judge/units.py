@@ -8,7 +8,7 @@ from ftcalib.findings import Finding, Severity
 from ftcalib.model import Parameters
 
 USUAL_COM_M = (0.02, 0.2)
-# Distances of the centre of mass: beyond the first, an undescribed tool limits a result; beyond the second, any tool.
+# Distances of the centre of mass above which a result is limited: if the tool is not described, and with any tool.
 FAR_COM_M, FARTHEST_COM_M = 0.25, 0.5
 NEAREST_COM_M = 5e-4
 # Weights outside the first two limits look like forces in another unit: below 30 g, or above the payload of UR arms.
@@ -96,7 +96,7 @@ def implausible(
     any_bias : bool
         Whether the zero of the sensor is arbitrary.
     unit_N : (float, float), optional
-        Size of the unit of force by a known mass, from `unit_of_force`.
+        Size of the unit of force according to a known mass, from `unit_of_force`.
     """
     weight_N, com_m = estimate.weight_N, float(np.linalg.norm(estimate.p_sensor_com_m))
     findings = [*([] if any_bias else _bias(estimate, unit_N)), *too_light(weight_N, com_m, residual_N)]

@@ -47,9 +47,9 @@ SMOOTH_SHARE, CALIBRATED_ARM_RAD = 0.0005, 0.001
 USUAL_LEVER_M = 0.1
 CORRELATED = 0.9
 FEW_LEFT_OUT = 0.1
-# Torque residual, as a share of the change of the torques, from which torques do not follow the weight.
+# Torque residual, as a share of the change of the torques, above which the torques do not follow the weight.
 UNRELATED = 0.8
-# Number of poses in which mistakes are searched, and length of the runs of successive poses among them.
+# Number of poses that are searched for mistakes, and length of the runs of successive poses among them.
 ENOUGH_FOR_FAULTS, SUCCESSIVE = 2000, 100
 # False-alarm probability of a finding.
 SURE = 1e-3
@@ -257,7 +257,7 @@ def judge(case: Case, quality: Quality, causes: Sequence[Finding]) -> Quality:
         *([] if cable is None else cable[:1]),
     ]
     findings += _cell_findings(case, quality, findings, mistaken=mistaken, broken=bool(broken))
-    # Contradictions to known values are reported only if the data have no mistake and do not fit the measured noise.
+    # Contradictions with known values are reported only if the data have no mistake and do not fit the measured noise.
     if not (broken or mistaken or quality.fits_measured_noise):
         harmless = verdict_of(findings) == "good"
         findings += [replace(each, severity="note") if harmless else each for each in contradicted]
@@ -364,7 +364,7 @@ def _unit_findings(case: Case, quality: Quality, contradicted: Sequence[Finding]
 def _cell_findings(
     case: Case, quality: Quality, findings: Sequence[Finding], *, mistaken: bool, broken: bool
 ) -> list[Finding]:
-    """Return contradictions to the described cell, unless other findings make the estimates meaningless."""
+    """Return contradictions with the described cell, unless other findings make the estimates meaningless."""
     parameters, covariance, setup = case.found.parameters, case.found.covariance, case.setup
     load_kg, named = parameters.weight_N / case.g_m_s2, list[Finding]()
     payload = described_cell.payload(setup.payload_kg, load_kg, setup.sensor_mass_kg, parameters)
@@ -407,7 +407,7 @@ def _unrelated_torques(found: Estimate, quality: Quality) -> list[Finding]:
 
 
 def _some_runs(t_s: Array | None, n: int) -> NDArray[np.intp]:
-    """Return the rows in the order of time: all, or evenly spread runs of many poses."""
+    """Return the rows in the order of time: all of them, or evenly spread runs if there are many poses."""
     order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
     return np.asarray(order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0])
 

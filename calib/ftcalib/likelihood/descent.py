@@ -238,7 +238,7 @@ class Descent:
         """Return the minimum that Levenberg-Marquardt steps reach from given parameters."""
         H, g, cost = self.normal_equations(statistics, p)
         b, F0, T0 = p.gravity_force_base_N, p.force_bias_N, p.torque_bias_Nm
-        prediction = np.concatenate([np.zeros(3), b, F0, np.zeros(3), T0])  # times the Jacobian is the predicted wrench
+        prediction = np.concatenate([np.zeros(3), b, F0, np.zeros(3), T0])  # Jacobian times this: predicted wrench
         rounding = 1e-14 * float(np.sqrt(max(prediction @ H @ prediction, 0.0)))
         damping, moved, settled = 0.0, np.inf, False
         for _ in range(steps):

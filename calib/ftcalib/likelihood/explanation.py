@@ -277,11 +277,11 @@ def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) ->
 
 # With more poses than this, single poses are examined only if chi2 or `drift` requires it.
 MANY_POSES = 20_000
-# Size of the subset of more than 1000 poses in which walks and structured errors are searched.
+# Size of the subset of more than 1000 poses that is searched for walks and structured errors.
 SEARCHED = 300
 # With fewer poses than this, the distribution of the Mahalanobis distances is not tested.
 POSES_FOR_THE_SHAPE = 500
-# P-value of chi2 below which components are searched.
+# P-value of chi2 below which components are searched for.
 SUSPICIOUS = 0.01
 # Ratio of median to mean of the squared distances, relative to that of Gaussian noise.
 LIGHT_TAIL = 0.6
@@ -289,7 +289,7 @@ LIGHT_TAIL = 0.6
 ROUNDS = 20
 # Convergence: squared step, in standard deviations of the estimates.
 SETTLED = 1e-4
-# Difference of chi2 from which a minimum is excluded under any noise model.
+# Difference in chi2 above which a minimum is excluded under any noise model.
 FAR = 1000.0
 MEDIAN_DISTANCE = float(chi2_isf(6, 0.5))
 
@@ -355,7 +355,7 @@ def explain(session: SessionData) -> tuple[Explanation, list[Minimum], float]:
 def _explanation_of_some(session: SessionData) -> Explanation | None:
     """Explain a subset of many poses; return None if the subset shows neither a walk nor structured errors.
 
-    Structured errors look like walks of many axes, slow to fit with many poses, which do not determine them better.
+    Structured errors look like walks of many axes. With many poses they are slow to fit and not determined better.
     """
     some = session.some(SEARCHED)
     e, _, _ = explain(some)
@@ -528,7 +528,7 @@ def _with_all_minima(session: SessionData, e: Explanation, others: list[Minimum]
     ends = [
         session.descent.down(statistics, start) for start in (e.parameters, *(minimum.parameters for minimum in others))
     ]
-    if e.noise_moves:  # compare the competing minima each with its own noise
+    if e.noise_moves:  # compare the minima, each evaluated with its own noise
         least = ends[0].chi2
         ends = [_under_own_noise(session, e, end, logdet) if end.chi2 < least + FAR else end for end in ends]
     return session.descent.distinct(ends)

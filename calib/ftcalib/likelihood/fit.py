@@ -37,7 +37,7 @@ from ftcalib.likelihood.variance_components import (
 from ftcalib.model import BIASES, STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters, jacobian, predict
 from ftcalib.sensor_matrix import SIZE, Calibrated, Response, sensor_columns
 
-# Difference of the criterion from which structured errors are certain; real ones give 250 or more in 24 poses.
+# Difference in the criterion above which structured errors are certain; real ones give 250 or more in 24 poses.
 _SURE = 40.0
 # Significant difference between two leave-one-out errors, as the logarithm of their mean squares.
 _CLEARLY = 0.05

@@ -87,7 +87,7 @@ class SessionData:
     ) -> None:
         self.n = len(wrench)
         self.gain_sigma, self.structured = gain_sigma, True
-        # Components found in a subset of many poses; no other walk or structured error is searched.
+        # Components found in a subset of many poses; no other walk or structured error is searched for.
         self.shown: Sequence[Component] | None = None
         self.given = R_base_flange, wrench
         self.drift, self.constraints = drift, constraints

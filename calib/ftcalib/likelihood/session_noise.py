@@ -230,6 +230,6 @@ def _suffix_sums(X: Array) -> Array:
 
 
 def centre(time: Array, origin: int | None = None) -> Array:
-    """Return time scaled to unit duration and shifted to mean zero, or to zero at one pose."""
+    """Return time scaled to unit duration and shifted to zero mean, or to zero at one pose."""
     zero = time.mean() if origin is None else time[origin]
     return np.asarray((time - zero) / max(np.ptp(time), 1e-300))

@@ -4,8 +4,8 @@
     cable        force and torque of a cable or hose: a linear function of the entries of the orientation matrix
     kinematics   orientation error of the arm: a linear function of the same entries
 
-The coefficients of a kind are random with mean zero and one variance. The basis functions have a norm of about 1 in
-every orientation, so the standard deviation is that of the error itself: a share of the weight, N and N·m, or rad.
+The coefficients of a kind are random with zero mean and a common variance. The basis functions have a norm of about 1
+in every orientation, so the standard deviation is that of the error itself: a share of the weight, N and N·m, or rad.
 
 Errors of arm and mounts that resemble a change of the parameters do not show in the data. Their sizes are assumed, and
 they are part of the sigmas of the parameters (`hidden_columns`). Hysteresis is not smooth: see `hysteresis_columns`.
@@ -141,10 +141,10 @@ def _of_each_channel(basis: Array) -> Array:
     return np.asarray(np.einsum("cd,nk->ncdk", np.eye(6), basis).reshape(len(basis), 6, -1))
 
 
-# Hysteresis: each axis lags behind by a share of its last change. Reading i is wrench i minus a share of its step,
-# wrench i minus wrench i - 1.
+# Hysteresis: each axis lags behind by a share of its last change. Reading i is wrench i minus a share of the step from
+# wrench i - 1 to wrench i.
 #
-# The six shares, one for each axis, have one variance. The step to the first pose is unknown, so a usual step is
+# The six shares, one for each axis, have a common variance. The step to the first pose is unknown, so a usual step is
 # assumed for it. The compensation does not model steps, so hysteresis is part of the noise of a reading.
 
 # With more poses than this, the unknown step to the first pose is negligible.

@@ -1,6 +1,6 @@
 """Variance components by restricted maximum likelihood: error sources beyond the measured noise of each pose.
 
-The residuals r of all poses at the present parameters follow a linear mixed model,
+The residuals r of all poses at the current parameters follow a linear mixed model,
 
     r = J x + T u + e,    e ~ N(0, V),    u_k ~ N(0, theta_k I),    V = blockdiag(D_i + white + rotation) + walk
 

@@ -110,7 +110,7 @@ _MISTAKES: Mapping[Kind, list[float]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linear:
-    """Model linearised at its present values; one list entry per run."""
+    """Model linearised at its current values; one list entry per run."""
 
     J: list[Array]
     """(6n, k) derivatives of the readings with respect to all unknowns."""
@@ -140,7 +140,7 @@ class Evaluated:
     """Weighted residual (6n,) of each run, and its covariance (6n, 6n) under the model."""
 
     def gain_of(self, run: int, columns: Array, sigma: Array) -> float:
-        """Return the cost reduction by further quantities with derivatives (6n, m) and priors `sigma` in one run."""
+        """Return the cost reduction from further quantities with derivatives (6n, m) and priors `sigma` in one run."""
         residual, projection = self.unexplained[run]
         b, M = (columns.T @ residual) * sigma, columns.T @ projection @ columns * np.outer(sigma, sigma)
         with_prior = np.eye(len(b)) + M
@@ -148,7 +148,7 @@ class Evaluated:
 
 
 class LoadModel:
-    """Model of runs with known loads: all unknowns at their present values.
+    """Model of runs with known loads: all unknowns at their current values.
 
     The initial values are a mounting and `tool`: mass (kg) and centre of mass from the sensor origin, flange axes. The
     direction of `gravity_base_m_s2` is declared, and also estimated. `tool_mass_kg` is the weighed mass with its sigma.
@@ -201,7 +201,7 @@ class LoadModel:
         self.x[self.at[name]] = self.expected[self.at[name]] = values
 
     def with_mistake(self, mistake: Mistake) -> "LoadModel":
-        """Return a copy with one more mistake, at the present values."""
+        """Return a copy with one more mistake, at the current values."""
         other, size = copy(self), len(mistake.sigma)
         end = len(self.x)
         other.at = {**self.at, f"mistake {len(self.mistakes)}": slice(end, end + size)}
@@ -224,7 +224,7 @@ class LoadModel:
         return self.x[self.at["matrix"]].reshape(6, 6)
 
     def linear(self) -> Linear:
-        """Return the model linearised at the present values."""
+        """Return the model linearised at the current values."""
         at, x = self.at, self.x
         g = self.g + self._across @ x[at["tilt"]]
         turn = np.kron(np.eye(2), self.R.T)

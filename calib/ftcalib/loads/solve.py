@@ -1,7 +1,7 @@
 """Calibration of a sensor's matrix from runs with known loads: a joint fit of all runs, and detection of mistakes.
 
 Source: S. Traversaro, D. Pucci, F. Nori, "In situ calibration of six-axis force-torque sensors using accelerometer
-measurements", ICRA 2015 (arXiv 1410.0885), extended by a prior of the matrix, unknown positions and disturbances.
+measurements", ICRA 2015 (arXiv 1410.0885), extended by a prior on the matrix, unknown positions and disturbances.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.sensor_matrix import SensorMatrix, ranges
 from ftcalib.solver import solve
 
-# Required reduction of -2 log likelihood by a mistake, in addition to `_penalty`.
+# Required reduction of -2 log likelihood due to a mistake, in addition to `_penalty`.
 _CLEARLY = 12.0
 _MOST_MISTAKES = 4
 # Largest number of candidate mistakes that are fitted completely.
@@ -342,7 +342,7 @@ def _mass_finding(name: str, found_kg: float, sigma_kg: float, given_kg: float) 
 
 
 def _swapped(begun: LoadModel, at: Evaluated) -> Finding | None:
-    """Return a finding if exchanging the declared positions of two loads explains the readings better."""
+    """Return a finding if swapping the declared positions of two loads explains the readings better."""
     rows = [k for k, run in enumerate(begun.runs) if run.load is not None and run.load.p_flange_m is not None]
     for a, b in combinations(rows, 2):
         first, second = (begun.at[f"load {begun.load_of(row)}"] for row in (a, b))

@@ -218,7 +218,7 @@ def _join(
     start: tuple[MovingLoad, Array],
     weighed: tuple[RowNoise, NDArray[np.bool_], NDArray[np.intp]],
 ) -> tuple[MovingLoad, Array, Solution, str]:
-    """Fit rows and prior together, starting from the fit of the rows alone; also return the contradiction to the prior.
+    """Fit rows and prior together, starting from the fit of the rows alone; also return how they contradict the prior.
 
     `weighed` holds the noise, the kept rows and the states of motion, as determined from the rows alone.
     """

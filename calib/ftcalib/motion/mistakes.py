@@ -28,8 +28,8 @@ _FARTHEST_M: Final = 3.0
 _LENGTHS_M: Final[Mapping[str, float]] = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
 # Largest relative difference between the scale of the acceleration and a unit.
 _SAME_UNIT: Final = 0.2
-# Largest residuals, as shares of the change of force and torque, of a fit that explains the data, and the residuals
-# from which wrong axes are suspected.
+# Residuals as shares of the change of force and torque: the largest ones of a fit that explains the data, and those
+# above which wrong axes are suspected.
 _EXPLAINED: Final = np.array([0.15, 0.3])
 _SUSPECT: Final = 0.05
 # A weight below this share of the inertial mass means that the wrench was gravity-compensated.

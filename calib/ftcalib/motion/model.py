@@ -69,7 +69,7 @@ class MovingLoad:
 
     @property
     def vector(self) -> Array:
-        """(34,) present values of the coordinates with a prior about zero; 0 for the 15 static ones."""
+        """(34,) current values of the coordinates with a prior about zero; 0 for the 15 static ones."""
         return np.concatenate([np.zeros(15), self.inertia, [self.height_m, self.delay_s], self.response])
 
     @property
@@ -103,13 +103,13 @@ class PoseError:
     """Scale of `Omega`: equal to `scale` if the times are wrong, 1 if only the positions are wrong."""
 
     def undone(self, motion: Motion) -> Motion:
-        """Return a motion, or the rate of change of a motion, without the error."""
+        """Return a motion, or the rate of change of a motion, with the error removed."""
         Omega = self.turning * motion.Omega_rad2_s2
         acceleration = self.scale * motion.acceleration_m_s2 + Omega[:, :, :2] @ self.aside_m
         return Motion(motion.R_base_flange, acceleration, Omega)
 
     def corrected(self, rows: MotionRows) -> MotionRows:
-        """Return the rows without the error."""
+        """Return the rows with the error removed."""
         return replace(rows, motion=self.undone(rows.motion), rate=self.undone(rows.rate))
 
     @staticmethod

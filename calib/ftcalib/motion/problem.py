@@ -242,7 +242,7 @@ class Problem:
         return np.asarray(np.sqrt(square.mean(axis=0).reshape(2, 3).sum(axis=1)))
 
     def prior(self, load: MovingLoad) -> tuple[Array, Array]:
-        """Return the prior precision (34,) of inertia, height and delay, 0 for the others, and the present values."""
+        """Return the prior precision (34,) of inertia, height and delay, 0 for the others, and the current values."""
         sigma = np.full(SIZE, np.inf)
         sigma[INERTIA] = max(load.mass_kg, 0.1) * GYRATION_M**2
         sigma[HEIGHT], sigma[DELAY] = HEIGHT_M, DELAY_S
@@ -377,7 +377,7 @@ class Problem:
         P, on, _ = self.components({**sizes, name: 0.0}, load)
         value = np.concatenate([load.vector, self.basis.T @ effects])
         rows, residuals = self.constraints.measurements(load.static)
-        # Linearised at the present load, with all effects 0.
+        # Linearised at the current load, with all effects 0.
         value[:15] = 0.0
         b, H = b + H @ value, H + P
         H[:15, :15] += rows.T @ rows

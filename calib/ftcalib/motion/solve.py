@@ -50,7 +50,7 @@ from ftcalib.sensor_matrix import Calibrated, Response
 
 # Shortest usable motion without a gap.
 LEAST_S = 5.0
-# Largest delay that is searched.
+# Largest delay that is tried.
 FARTHEST_S = 1.5
 # A longer delay than this is reported as a clock error.
 OFFSET_S = 0.1
@@ -65,9 +65,9 @@ SLOW_RAD_S = 0.15
 _FOLLOWS, _OTHER_RATE = 0.03, 0.5
 # Smallest difference of clock rates that is corrected, and the trial ratios relative to the ratio of the durations.
 _SAME_RATE, _RATIOS = 3e-3, 1 + np.linspace(-0.06, 0.06, 49)
-# Interpolation error from which poses are too coarse for their motion; then only rows slower than this are used.
+# Interpolation error above which poses are too coarse for their motion; then only rows slower than this are used.
 _COARSE_RAD, _REST_RAD_S = 8e-3, 0.02
-# Radius on which an arm moves the flange: bounds the unknown acceleration if positions are missing.
+# Radius at which an arm moves the flange. It bounds the unknown acceleration if positions are missing.
 REACH_M = 1.0
 NARROW_DEG = 45.0
 # A parameter is determined if its sigma is below this share of its prior sigma.
@@ -75,7 +75,7 @@ MEASURED = 0.3
 WRONG_HEIGHT_M = 3e-3
 # Share of rows in contact that limits a result.
 MOSTLY = 0.5
-# Residual, as a share of the change of the force, from which wrench and poses do not belong together.
+# Residual, as a share of the change of the force, above which wrench and poses do not belong together.
 _UNEXPLAINED = 0.3
 # Prefixes of the names of components that are smooth functions of the pose.
 _SMOOTH = ("load", "cable", "rotation", "yielding")
@@ -254,7 +254,7 @@ def _on_one_clock(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream],
 def _coarse_delay(rows: MotionRows) -> tuple[float, float]:
     """Return the delay, s, at which a linear function of the motion explains the wrench best, and the median residual.
 
-    The delay is searched in whole rows. The residual is relative to the standard deviation of each channel.
+    Delays of whole numbers of rows are tried. The residual is relative to the standard deviation of each channel.
     """
     if len(rows) * rows.row_s < LEAST_S:
         raise BadDataset(f"only {len(rows) * rows.row_s:.1f} s of motion are free of gaps: record 20 s or more")
@@ -298,7 +298,7 @@ def _select_rows(rows: MotionRows, limit_rad_s: float) -> MotionRows:
 
 
 def _require_enough_motion(rows: MotionRows, best: MotionFit, known: Known | None) -> None:
-    """Raise `NotObservable` if mounting or gravity force are so uncertain that a prediction would be useless."""
+    """Raise `NotObservable` if the mounting or the gravity force is so uncertain that a prediction would be useless."""
     mounting_rad = float(np.sqrt(np.diag(best.covariance)[:3].max()))
     weight_N = best.load.static.weight_N
     sigma_N = float(np.sqrt(np.diag(best.covariance)[3:6].max()))

@@ -75,7 +75,7 @@ class ForceEquations:
 def force_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method: str, min_poses: int) -> ForceEquations:
     """Return the equations of a method after checking its input; estimating a `bias` needs one more pose.
 
-    Raises `NotObservable` for fewer than `min_poses`, `BadDataset` for a value not finite, `ValueError` for shapes.
+    Raises `NotObservable` for fewer than `min_poses`, `BadDataset` for a non-finite value, `ValueError` for shapes.
     """
     n = len(force_N)
     if R_base_flange.shape != (n, 3, 3) or force_N.shape != (n, 3):
@@ -286,7 +286,7 @@ def require_weight(eq: ForceEquations) -> None:
 def require_turns_and_weight(eq: ForceEquations) -> None:
     """Raise `NotObservable` if all poses turn about one base axis, along which weight and bias cannot be separated.
 
-    Raises also like `require_weight`.
+    Also raises whatever `require_weight` raises.
     """
     if spanned_dimensions(eq.D, len(eq.A) ** 0.5) < 3:
         raise NotObservable(

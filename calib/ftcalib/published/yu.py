@@ -53,7 +53,7 @@ def srom(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] | 
     Raises
     ------
     NotObservable
-        Like `special_numbers`.
+        As in `special_numbers`.
     """
     return _from_special(R_base_flange, wrench, *(numbered or special_numbers(R_base_flange)))
 
@@ -74,7 +74,7 @@ def mixed(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] |
     Raises
     ------
     NotObservable
-        As `special_numbers` with `others`.
+        As in `special_numbers` with `others`.
     """
     return _from_special(R_base_flange, wrench, *(numbered or special_numbers(R_base_flange, others=True)))
 
