@@ -1,6 +1,6 @@
 """The clock of the drivers: one object, passed to all code that waits or computes the age of a sample.
 
-`REAL` is the clock of the computer. The clock of an emulated cell waits for a reader that gets no processor time. The
+`REAL` is the clock of the computer. The clock of an emulated cell waits for a reader that gets no CPU time. The
 clock of a test moves only when the test advances it. Drivers never call `time.monotonic` or `time.sleep`.
 """
 
@@ -34,7 +34,7 @@ class Clock(ABC):
     poll_s = 0.05
     """Longest time for which one read may block, s of real time. The time of an emulated cell stops meanwhile."""
     lead_s = 0.0
-    """Largest lag of a device behind this clock, s: an emulator in another process may get no processor time."""
+    """Largest lag of a device behind this clock, s: an emulator in another process may get no CPU time."""
     can_be_held = False
     """Whether time stops during a `held` block."""
 
@@ -61,7 +61,7 @@ class Clock(ABC):
     def looks(self, duration_s: float) -> Iterator[float]:
         """Yield the time left of `duration_s`, s, and finally 0.
 
-        Because of this last turn, data that arrived in time are read even if this thread is late.
+        Because of this last iteration, data that arrived in time are read even if this thread is late.
         """
         end_ns = self.now_ns() + round(duration_s * 1e9)
         while (left_ns := end_ns - self.now_ns()) > 0:

@@ -66,7 +66,7 @@ class Unread(Generic[Item]):
             )
 
     def take(self) -> list[Item]:
-        """Return the items of the queue and empty it. Raises like `check`."""
+        """Return the items of the queue and empty it. Raises whatever `check` raises."""
         self.check()
         items, self._items, self._samples = self._items, [], 0
         return items

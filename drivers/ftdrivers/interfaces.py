@@ -112,7 +112,7 @@ class Columns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FtSamples(Columns):
-    """n consecutive samples of one sensor, one row each, as measured: no bias, tare or filter applied.
+    """n consecutive samples from one sensor, one row each, as measured: no bias, tare or filter applied.
 
     The wrench is exerted on the sensor by its load and by contacts, in sensor axes, about the sensor's origin.
 
@@ -253,11 +253,11 @@ class ArmStatus:
     program: str
     """State of the program: "stopped", "playing", "paused", or a transition. The control program of ftdrive counts."""
     fault: DeviceFault | None
-    """Reason why the arm may not move, and what the operator has to do; None if it may move."""
+    """Reason why the arm may not move, and what the operator must do; None if it may move."""
     speed_slider: float
     """Speed slider, 0 to 1, as set on the pendant or by a program."""
     speed_scaling: float
-    """Fraction of the programmed speed that the controller allows at the moment, 0 to 1."""
+    """Fraction of the programmed speed that the controller currently allows, 0 to 1."""
     payload_kg: float | None
     """Mass of the payload that is configured in the controller, kg."""
     p_flange_payload_m: tuple[float, ...] | None

@@ -65,7 +65,7 @@ class Options:
         return self.text(key, "") if key in self._given else None
 
     def integer(self, key: str, default: int, lowest: int, highest: int) -> int:
-        """Return an option as an integer, written as decimal or 0x hexadecimal number."""
+        """Return an option as an integer, written as a decimal or a 0x hexadecimal number."""
         text = self.text(key, str(default))
         try:
             value = int(text, 0)

@@ -1,4 +1,4 @@
-"""Transcripts: files with the bytes on the wire of a sensor. `recording` writes them, `Player` plays them to a driver.
+"""Transcripts: files with the bytes on a sensor's wire. `recording` writes them, `Player` plays them to a driver.
 
 A transcript (``ftdrive.transcript/1``) consists of JSON lines. The first holds sensor, time and versions. The others
 have the time of the driver's clock as `t_ns`:

@@ -1,4 +1,4 @@
-"""Disturbances: contacts and cables that pull at the tool, and drift of the bias.
+"""Disturbances: contacts, cables that pull on the tool, and drift of the bias.
 
 Not modelled: masses on springs, friction, forces that depend on the speed of the arm.
 """
@@ -76,7 +76,7 @@ class Ramp:
 
 @dataclass(frozen=True)
 class Cable:
-    """A cable that pulls at a point of the tool while it is taut.
+    """A cable that pulls on a point of the tool while it is taut.
 
     Parameters
     ----------

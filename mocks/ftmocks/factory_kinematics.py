@@ -56,7 +56,7 @@ def drawn(model: str, seed: int) -> Dh:
 
 
 def link_frames(chain: Chain) -> list[Array]:
-    """Return the frames (4, 4) of links in the base at zero joint angles, with z on the joint axis; last the flange."""
+    """Return the frames (4, 4) of links in the base at zero joint angles, with z on the joint axis, the flange last."""
     frames, X = [], np.eye(4)
     for a, pitch, roll, d in zip(*chain, strict=True):
         link = np.eye(4)

@@ -12,7 +12,7 @@ Chosen here, where the sources are silent:
 
 * The gear ratio is 101. The shares of k = 2, 4, 6 in the power are 60, 30 and 10 %.
 * The ripple is an acceleration of the tool along the axes of the sensor, whatever the tool's mass. It has its full size
-  however many joints turn, shared according to their speeds. Below .3 rad/s, the ripple of a joint decreases with the
+  however many joints rotate, shared according to their speeds. Below .3 rad/s, the ripple of a joint decreases with the
   square of its speed, as does the acceleration due to a position error of a gear.
 * Each joint rings behind its encoder, as a mass on a spring that follows the joint. The seed determines the frequency.
 * The noise of joint angles is white, also at rest; joint speeds have none.
@@ -53,7 +53,7 @@ class Imperfections:
     Parameters
     ----------
     ripple, ring
-        Vibration while joints turn, and after they accelerate, as multiples of the sizes above.
+        Vibration while joints rotate, and after they accelerate, as multiples of the sizes above.
     gear_ratio
         Revolutions of the motor per revolution of the joint.
     servo_lag_s
@@ -65,7 +65,7 @@ class Imperfections:
     wrist_friction_Nm
         Friction of wrist 3 in the readings of the built-in sensor.
     wrist_drift_N
-        Drift of the built-in sensor in z in the first 10 minutes.
+        Drift of the built-in sensor along z in the first 10 minutes.
     """
 
     ripple: float = 1.0
@@ -106,7 +106,7 @@ IDEAL = Imperfections(
 
 
 class WarmUp(NamedTuple):
-    """Drift of the built-in sensor after the arm was started: `drift_N` in z within 10 minutes."""
+    """Drift of the built-in sensor after the arm was started: `drift_N` along z within 10 minutes."""
 
     drift_N: float
     start_s: float

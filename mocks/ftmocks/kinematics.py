@@ -118,7 +118,7 @@ _IDENTITY: _Rows = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 
 def _chain(dh: Dh, q: Sequence[float]) -> list[_Rows]:
-    """Return frames 0 to 6 in the base. Scalar arithmetic needs a tenth of the time of twelve small matrix products."""
+    """Return frames 0 to 6 in the base. Scalar arithmetic takes a tenth of the time of twelve small matrix products."""
     frames = [_IDENTITY]
     m = _IDENTITY
     for angle, (offset, a, d, ca, sa) in zip(q, dh.links, strict=True):

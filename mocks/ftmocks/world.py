@@ -61,7 +61,7 @@ class Truth:
     gyration_m2: Array | None = None
     """(3, 3) inertia tensor per mass about the centre of mass, sensor axes; None for a payload without inertia."""
     sensor_mass_kg: float = 0.0
-    """Mass of sensor and adapter, which the sensor does not measure: a point halfway from flange to sensor origin."""
+    """Mass of sensor and adapter, which the sensor does not measure: a point midway from flange to sensor origin."""
     sensor_errors: SensorErrors = PERFECT
 
     @classmethod
@@ -182,7 +182,7 @@ def _on_circle(rng: np.random.Generator) -> Array:
 
 
 class Cycle(NamedTuple):
-    """Motion of the arm from a control cycle on."""
+    """Motion of the arm, starting at a control cycle."""
 
     t_s: float
     """Time of the cycle on the cell's clock."""
@@ -262,7 +262,7 @@ class World:
         self._joints_at: dict[float, tuple[JointState, bool]] = {}
 
     def move(self, t_s: float, q: Vector6, motion: Callable[[float], JointState] | None) -> None:
-        """Set the motion of the arm from a control cycle on, see `Cycle`."""
+        """Set the motion of the arm, starting at a control cycle, see `Cycle`."""
         last = self._cycles[-1]
         if motion is not None or last.motion is not None or last.q is not q:
             self._cycles = (*self._cycles[1 - REMEMBERED :], Cycle(t_s, q, motion))

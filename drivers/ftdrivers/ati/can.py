@@ -48,7 +48,7 @@ _HEARTBEATS = frozenset(range(0x701, 0x780))
 class AtiCanSensor(StreamingSensor):
     """An ATI NETCANOEM sensor on any CAN interface of python-can.
 
-    `seq` counts polls, `t_device_s` is NaN, `counts` are the six gauges. A poll without a reply is a lost sample.
+    `seq` counts polls, `t_device_s` is NaN, `counts` are the six gauge values. A poll without a reply is a lost sample.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ class AtiCanSensor(StreamingSensor):
         )
 
     def _read_block(self) -> FtSamples:
-        # The next poll is sent before this reply is decoded, so that the NETCANOEM prepares its reply meanwhile.
+        # The next poll is sent before this reply is decoded, so that the NETCANOEM can already prepare its next reply.
         if not self._asked:
             self._clock.sleep(self._next_poll_s - self._clock.now_s())
             self._poll()

@@ -65,7 +65,7 @@ STATUS_BITS: Mapping[int, str] = {
 WATCHDOG_RESET = 0x0001
 # All bits except watchdog reset, configuration, CAN and the summary bit: a healthy unit had the CAN bit set.
 CRITICAL = 0x18FE
-"""Status bits that make the data unusable. The device keeps sending data, so the host has to check these bits."""
+"""Status bits that make the data unusable. The device keeps sending data, so the host must check these bits."""
 
 
 class GaugeReading(NamedTuple):

@@ -36,7 +36,7 @@ _SILENCE_S = 0.2
 # Bytes for which one read waits, 4 ms of stream. Larger batches need less CPU but delay the guards. The records of a
 # batch share one time stamp, because evenly spread stamps would suggest a precision that they do not have.
 _BATCH_BYTES = 28 * modbus.RECORD_SIZE
-# If the error bit is set but the status word is clear, a byte was damaged. Three times in a row it is a fault.
+# If the error bit is set but the status word is clear, a byte was damaged. Three times in a row are a fault.
 _MAX_RESTARTS = 3
 
 
@@ -204,7 +204,7 @@ class AtiSerialSensor(StreamingSensor):
             raise DeviceTimeout(exc.found, f"{exc.fix}, check termination and address") from exc
 
     def _start_stream(self) -> None:
-        self._ask(modbus.START, self._jam)  # if only the reply was lost, the stream runs already
+        self._ask(modbus.START, self._jam)  # if only the reply was lost, the stream is already running
         self._buffer.clear()
         self._damaged.clear()
 

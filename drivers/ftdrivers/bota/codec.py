@@ -47,7 +47,7 @@ class Frame(NamedTuple):
     wrench: tuple[float, ...]
     """(6,) force in N, then torque in N·m."""
     t_us: int
-    """Time on the sensor's clock, µs, which wraps at 2**32 µs, that is every 71.6 minutes."""
+    """Time on the sensor's clock, µs, which wraps at 2**32 µs, that is, every 71.6 minutes."""
     temperature_C: float
 
 

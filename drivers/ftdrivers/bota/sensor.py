@@ -161,7 +161,7 @@ class BotaSensor(StreamingSensor):
     def _configure(self, baud: int, sinc: int) -> None:
         # Only what the address requests is changed; a sensor in another mode needs ?sinc=512 once.
         self._command(codec.ENTER_SETUP)
-        if not codec.find_identity(self._text).serial:  # the sensor did not boot now, and must be asked
+        if not codec.find_identity(self._text).serial:  # the sensor has not just booted, so it must be asked
             with contextlib.suppress(DeviceTimeout):
                 self._command(codec.ASK_SERIAL, attempts=1)
         for command in (*codec.setup_commands(baud, sinc), codec.ENTER_RUN):

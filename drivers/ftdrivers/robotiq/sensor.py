@@ -231,7 +231,7 @@ class RobotiqFt300(StreamingSensor):
         self._port.drain(_SILENCE_S, _STOP_S)
 
     def _ask(self, request: bytes) -> tuple[int, ...]:
-        """Exchange with retries, each after another stop, because an earlier stream may still run."""
+        """Send a request and return the reply; stop the stream again before each retry, because it may still run."""
         return ask(self._port, self.name, request, codec.check_reply, self._clock, _REPLY_S, self._stop_stream)
 
     def _rate_fix(self, rate_Hz: float) -> str:

@@ -28,7 +28,7 @@ _MOST_WAITING = 1000
 
 
 class Halves:
-    """Pairs first and second halves to fields, and drops every pair that may belong to two samples.
+    """Pairs first and second halves into fields, and drops every pair that may belong to two samples.
 
     First and second halves must alternate. This condition is not sufficient: if a second half and the next first half
     are lost, the others still alternate, but one field is missing. Therefore fields are accepted in the first silence

@@ -30,7 +30,7 @@ class RobotousSensor(StreamingSensor):
     """A Robotous RFT. A subclass sends and receives fields on one wire.
 
     `counts` are the six raw values, `t_device_s` is NaN, and `status` holds the overload bits (5 for Fx to 0 for Tz).
-    Any overload raises `DeviceFault`. Samples carry no number. On a UART, `seq` counts received frames including
+    Any overload raises `DeviceFault`. Samples carry no number. On a UART, `seq` counts received frames, including
     damaged ones, so a lost sample is only visible in the rate. On CAN, lost samples are detected by the clock.
 
     Parameters

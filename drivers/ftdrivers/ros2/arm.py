@@ -1,4 +1,4 @@
-"""An arm of any make that is read through topics of ROS 2 and never moved.
+"""An arm of any make that is read through ROS 2 topics and never moved.
 
 Ref: REP 105 (frames), geometry_msgs/msg/PoseStamped, sensor_msgs/msg/JointState, tf2_msgs/msg/TFMessage.
 Checked on hardware: no. Verified against: tests/ros2.
@@ -31,7 +31,7 @@ _SPEED_NS: Final = 100_000_000
 # Lever with which a translation is converted to an angle.
 _LEVER_M: Final = 1.0
 _MOST_UNREAD: Final = 1_000_000
-# Stamps that go back by more than this, s, were given by another clock.
+# Stamps that go back by more than this, s, come from another clock.
 _BACK_S: Final = 0.5
 
 

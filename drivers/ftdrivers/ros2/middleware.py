@@ -1,4 +1,4 @@
-"""A node of ROS 2 and its subscriptions.
+"""A ROS 2 node and its subscriptions.
 
 Reason: docs/decisions/sensors.md, 179.
 """
@@ -22,7 +22,7 @@ _PROFILES: Final = {"FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_
 
 
 def ros2_module(name: str) -> Any:
-    """Import a module of ROS 2, such as "rclpy" or "geometry_msgs.msg". Raises `NoRos2`."""
+    """Import a ROS 2 module, such as "rclpy" or "geometry_msgs.msg". Raises `NoRos2`."""
     # The ROS wheels restart Python to set LD_LIBRARY_PATH (30 ms). They lack tf2_msgs, so tf needs a sourced ROS.
     try:
         return importlib.import_module(name)
@@ -113,7 +113,7 @@ class Node:
 DISCOVERY_S: Final = 3.0
 """Time-out until the publishers of a topic are known, s."""
 _SAME_CLOCK_MS: Final = 2.0
-# A stamp that is older than this by the clock of this computer was given by another clock.
+# A stamp that is older than this by the clock of this computer comes from another clock.
 _LONGEST_WAY_MS: Final = 30.0
 # Time until a second publisher is known too.
 _OTHERS_S: Final = 0.5

@@ -155,7 +155,7 @@ def _pose_of(position: Any, quaternion: Any, what: str) -> tuple[Array, Array]:
 
 
 class Poses:
-    """Poses of the flange in the base from a topic of PoseStamped."""
+    """Poses of the flange in the base from a PoseStamped topic."""
 
     def __init__(self, topic: str) -> None:
         self.topics = {topic: "geometry_msgs/msg/PoseStamped"}

@@ -1,4 +1,4 @@
-"""A force/torque sensor of any make that is published on a topic of ROS 2.
+"""A force/torque sensor of any make whose wrench is published on a ROS 2 topic.
 
 Ref: geometry_msgs/msg/WrenchStamped; REP 103 (SI units), REP 105 (frames), REP 107 (stamps).
 Checked on hardware: no. Verified against: tests/ros2.

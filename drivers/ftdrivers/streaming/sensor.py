@@ -150,7 +150,7 @@ class StreamingSensor(ForceTorqueSensor):
         """Stop the stream and close the port within 0.3 s, also after a failed `_connect` or if the device was lost."""
 
     def _discard_backlog(self) -> None:
-        """Drop the samples that port or socket buffered while the reader paused."""
+        """Drop the samples that the port or the socket buffered while the reader paused."""
         # A read that has to wait shows that the buffer is empty.
         begin_s = self._turn_s
         while self._is_mine():
@@ -514,7 +514,7 @@ class StreamingSensor(ForceTorqueSensor):
         return block.rows(newer)
 
     def _fresh_rows(self, block: FtSamples, heard_s: float) -> FtSamples:
-        """Drop samples that are too late by the device's clock, because they were buffered on their way."""
+        """Drop samples that are too late by the device's clock, because they were buffered in transit."""
         late_s = self._device_clock.late_s(block.t_device_s, heard_s)
         is_late = bool(late_s[-1] > self._limits.stale_s)
         if is_late and not self._is_late:

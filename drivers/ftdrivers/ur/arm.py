@@ -119,7 +119,7 @@ class UrArm(RobotArm):
 
         Reading has no side effects and needs no remote control. Taking control starts a program on the controller,
         which zeroes the sensor in an e-Series wrist. A program that plays or is paused is never stopped, unless this
-        object has started it before. The operator has to clear a safety stop first; an interrupted move is not
+        object started it. The operator has to clear a safety stop first; an interrupted move is not
         continued. If `ConnectError` is raised, the arm is closed.
         """
         try:
@@ -557,7 +557,7 @@ class UrArm(RobotArm):
     def _check_ours(self, control: Control) -> None:
         """Raise `DeviceFault` if another program runs instead of the control program."""
         # Another program may look the same: it plays, and the registers hold the last values of ours. Only the control
-        # program answers the question for its TCP offset.
+        # program answers a request for its TCP offset.
         if not self._is_ours(control, timeout_s=self._timing.ours_s, look_out=self._look_out):
             raise (
                 control.end_reason()

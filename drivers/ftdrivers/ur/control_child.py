@@ -65,7 +65,7 @@ class Calls:
         self._before = 0
         self._unwatched = False
         self.moving = False
-        """Whether the arm moves. The parent then has to call `progress` regularly."""
+        """Whether the arm moves. The parent must then call `progress` regularly."""
 
     def move(self, q_rad: list[float], speed_rad_s: float, acceleration_rad_s2: float) -> bool:
         """Start a move; return whether the controller accepted it."""
@@ -112,7 +112,7 @@ class Calls:
         return self._control.getTCPOffset()
 
     def set_payload(self, mass_kg: float, com_m: list[float], inertia_kg_m2: list[float] | None) -> bool:
-        """Set the payload; return whether that succeeded. Without inertia, the older command resets the inertia."""
+        """Set the payload; return whether that succeeded. Without an inertia, the older command resets the inertia."""
         if inertia_kg_m2 is None:
             return self._control.setPayload(mass_kg, com_m)
         return self._control.setTargetPayload(mass_kg, com_m, inertia_kg_m2)

@@ -4,7 +4,7 @@ Ref: Universal Robots, "DH parameters for calculations of kinematics and dynamic
 `default_kinematics.yaml` of each model, version 2.4.5.
 
 A real arm differs from the nominal one by up to 7.5 mm and 1.3 degrees, and its controller uses measured parameters.
-Flange poses are those that the controller reports. Kinematics are used to check these poses, and for planning.
+Flange poses are those that the controller reports. Kinematics are used for checking these poses and for planning.
 """
 
 from collections.abc import Sequence

@@ -121,7 +121,7 @@ class Opening:
         return path_for(self.setting, self.reader.version)[0]
 
     def open(self) -> Control:
-        """Start the control program. Another program is never stopped, unless the same object has started it before.
+        """Start the control program. Another program is never stopped, unless the same object started it.
 
         Raises `ConnectError`, also if a safety stop prevents the start, and the exceptions of the reader.
         """

@@ -74,7 +74,7 @@ def _apart(one: Pose, other: Pose) -> tuple[float, float]:
 
 
 def _apart_as_share(one: Pose, other: Pose) -> float:
-    """Return the difference of two poses, as a fraction of the tolerance for a real arm of the model."""
+    """Return the difference between two poses, as a fraction of the tolerance for a real arm of the model."""
     distance_m, angle_rad = _apart(one, other)
     return max(distance_m / _MODEL_M, angle_rad / _MODEL_RAD)
 
@@ -176,12 +176,12 @@ class Reader:
         return self._wait(lambda: self._live is not before, self._timing.stale_s if limit_s is None else limit_s)
 
     def status(self) -> ArmStatus:
-        """Return modes and settings of a sample that is at most `UrTiming.status_s` old. Raises like `look`."""
+        """Return modes and settings of a sample that is at most `UrTiming.status_s` old. Raises as `look` does."""
         oldest_s = self._clock.awake_s() - self._timing.status_s
         return self._wait(lambda: self._live_s >= oldest_s, self._timing.stale_s).status()
 
     def state(self, ask_tcp: Callable[[], Sequence[float]]) -> ArmState:
-        """Read a state; `ask_tcp` returns the TCP offset (6,) if samples lack it. Raises like `UrArm.state`."""
+        """Read a state; `ask_tcp` returns the TCP offset (6,) if samples lack it. Raises as `UrArm.state` does."""
         sample, tcp_offset = self._look_with_tcp(ask_tcp)
         self._check_measures(sample)
         flange = sample.flange(tcp_offset)

@@ -1,4 +1,4 @@
-"""One sample of a Universal Robots controller, and the meaning of its numbers.
+"""One sample from a Universal Robots controller, and the meaning of its numbers.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide" (outputs, modes, states and safety status bits);
 `ur/datatypes.h` of Universal Robots' client library (safety modes 12 to 22).
@@ -108,7 +108,7 @@ _SAFETY: Final = (  # the first row whose bits are set is the most specific one
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One sample of the controller. Vectors are tuples in rad and m; orientations are rotation vectors."""
+    """One sample from the controller. Vectors are tuples in rad and m; orientations are rotation vectors."""
 
     t_host_ns: int
     t_device_s: float

@@ -15,7 +15,7 @@ _TURN_NS: Final = 50_000_000
 class UrTiming:
     """Time-outs in seconds. The defaults are for a real cell; docs/explanation/ur-controller.md has their effects."""
 
-    # Limits on samples of the controller are equal in real and emulated cells.
+    # Limits on samples from the controller are equal in real and emulated cells.
     stale_s: float = 0.2
     """Longest time without a sample."""
     status_s: float = 0.05

@@ -134,7 +134,7 @@ class CanBus:
     def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
         """Wait for the next data frame of the device and return (identifier, data); None after the time-out.
 
-        Raises `StreamBroken`. In an emulated cell it blocks too, because many short waits would delay the polls.
+        Raises `StreamBroken`. It also blocks in an emulated cell, because many short waits would delay the polls.
         """
         for left_s in self._clock.looks(timeout_s):
             if frame := self.look(left_s):
@@ -200,7 +200,7 @@ class CanProbe:
 
 
 def join_frames(frames: Sequence[CanFrame], parts: Mapping[int, int]) -> list[bytes]:
-    """Join frames to whole messages; an empty list if a frame is out of order or of the wrong length.
+    """Join frames into whole messages; return an empty list if a frame is out of order or of the wrong length.
 
     Parameters
     ----------

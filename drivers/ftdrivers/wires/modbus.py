@@ -103,7 +103,7 @@ def ask(
     ProtocolError
         The error that `check` raised, with the name of the device and a fix. A `Refused` is raised at once.
     """
-    # Libraries for Modbus cannot be used, because the same port later carries a stream without frames of Modbus.
+    # Modbus libraries cannot be used, because the same port later carries a stream without Modbus frames.
     for _ in range(_ATTEMPTS - 1):
         try:
             return _exchange(port, name, request, check, clock, timeout_s)

@@ -119,7 +119,7 @@ class SerialPort:
     baud : int
         Baud rate. There are always 8 data bits and 1 stop bit.
     even_parity : bool
-        True for even parity, false for none. Marks of the kernel for bytes of wrong parity are removed here.
+        True for even parity, false for none. The kernel's marks for bytes with wrong parity are removed here.
     read_s : float
         Time-out of one read, s of real time.
     clock : Clock

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ftcalib import CalibrationResult, SensorMatrix
 
 _NAME: Final = re.compile(r"sensor(?:-(\d+))?\.json")
-# Facts of a sensor for which its matrix is valid. Counts differ between calibration slots.
+# Facts about a sensor that must be unchanged for its matrix to be valid. Counts differ between calibration slots.
 _FACTS: Final = {
     "counts_per_N": "counts per N",
     "counts_per_Nm": "counts per N·m",

@@ -39,7 +39,7 @@ from ftdrivers.registry import Options, split_url
 
 # Options in the address of a sensor that select its factory calibration, with their defaults.
 _CHOOSES_CALIBRATION: Final = {"slot": 0, "calibration": 1}
-# Facts of a sensor that depend on its scale or factory calibration.
+# Facts about a sensor that depend on its scale or factory calibration.
 _OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range", "software_bias")
 
 

@@ -86,7 +86,7 @@ def trends_of(series: Sequence[StoredResult]) -> Iterator[QuantityTrend]:
 def _quantities(series: Sequence[StoredResult]) -> Iterator[tuple[str, str, list[tuple[float, Array, Array]]]]:
     """Yield each quantity with its unit, and (days, value, covariance) of the results that estimate it.
 
-    A value equal to an earlier one is a copy in an update; a value without variance was given as known.
+    A value equal to an earlier one was copied by an update; a value without variance was given as known.
     """
     first = datetime.fromisoformat(str(series[0].created_utc))
     days = [(datetime.fromisoformat(str(result.created_utc)) - first).total_seconds() / 86400 for result in series]

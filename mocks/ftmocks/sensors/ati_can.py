@@ -1,4 +1,4 @@
-"""An emulated ATI force/torque sensor with CAN interface (NETCANOEM) behind an emulated slcan adapter.
+"""An emulated ATI force/torque sensor with a CAN interface (NETCANOEM) behind an emulated slcan adapter.
 
 Ref: ATI 9610-05-1030-04 "F/T CAN Bus and Serial Bus Network Interface for OEM", CAN protocol and section 10 (start-up).
 

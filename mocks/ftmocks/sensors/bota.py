@@ -1,7 +1,7 @@
-"""An emulated Bota Systems SensONE with serial interface: text commands, and a stream of 37-byte frames.
+"""An emulated Bota Systems SensONE with a serial interface: text commands, and a stream of 37-byte frames.
 
-Ref: Bota Systems, SensONE serial user manual and the vendor's Python example (configuration, frame, CRC), which has the
-serial speed 460800 baud, and opens the port before it waits for ``App Init``. The vendor's driver rokubimini_serial:
+Ref: Bota Systems, SensONE serial user manual and the vendor's Python example (configuration, frame, CRC), which uses
+460800 baud and opens the port before it waits for ``App Init``. The vendor's driver rokubimini_serial:
 
 * Its version for ROS 1 waits for 3 s after it has opened the port, because the sensor boots (init).
 * Its version for ROS 2 has 230400 baud as default and 460800 as maximum (DEFAULT_BAUD_RATE_OPTION). It sends ``#`` for
@@ -14,7 +14,7 @@ tare, raw output, and two openings within 5 ms, which count as one.
 Chosen here, because the sources leave it open: the sensor restarts whenever a client opens the port, as with an adapter
 that supplies it, and prints its configuration after half of `boot_s`. At another speed, both sides receive noise.
 Commands need no line ending; CR, LF and spaces between them are ignored. While the sensor streams, it ignores
-everything but ``C``, ``I`` and ``#``. A configuration command with values out of range, or an unknown one, is answered
+all but ``C``, ``I`` and ``#``. A configuration command with values out of range, or an unknown one, is answered
 with error 1. A restart brings back what was stored; a new speed needs one. The CSV format is one line per sample with
 the fields of the frame. The sinc length may be 64 (800 Hz, the fastest of the data sheet) to 2048. ``p?`` is answered
 with ``p,0,NUMBER,1,0,NAME`` and ``r,0,p,0``.

@@ -5,7 +5,7 @@ and form of the elements are those of a page of a Gamma SI-330-30 (box firmware 
 revision 22 of the manual. It has tool transformation and software bias, as the emulated box has.
 
 * The software bias is six strain gauge counts (int16, sections 4.4 and 7.1), which the box subtracts from the gauges
-  before its matrix. The RDT command "bias" makes the present gauges the bias.
+  before its matrix. The RDT command "bias" makes the current gauge values the bias.
 * The tool transformation follows: displacements in the axes of the transducer, then rotations about x, the new y and
   the new z. The force is ``R.T F``, the torque ``R.T (T - d x F)`` with ``R = Rx Ry Rz``. Order and signs are those of
   ATI's own library (TTM in ftconfig.c of the DAQ F/T C library, in lagadic/visp).
@@ -14,7 +14,7 @@ revision 22 of the manual. It has tool transformation and software bias, as the 
 Does not model: the TCP interface, multi-unit mode, filters, monitor conditions, more than one configuration, the web
 pages, DHCP, rounding to gauge counts, and that a real box answers only a few HTTP requests in a row.
 
-Chosen here, because the sources leave it open: a new request of samples replaces the running one and its address.
+Chosen here, because the sources leave it open: a new request for samples replaces the running one and its address.
 "One-shot" sends its count of samples, one for count 0, at the set rate. A reading at its rating in the axes of the
 transducer sets the summary and saturation bits. Other datagrams are ignored. A bias set over HTTP survives
 a power failure, a bias set by RDT does not.

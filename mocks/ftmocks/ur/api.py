@@ -12,7 +12,7 @@ Chosen here, where the sources are silent:
   ``play`` and ``resume`` are answered by 500 when there is nothing to play or resume, and ``pause`` when none plays.
 * Answers are sent at once, also to ``POWER_ON``, which takes a while on a real controller.
 * A safeguard stop is reported as ``PROTECTIVE_STOP``, recovery as ``REDUCED`` and a violation as ``FAULT``, because the
-  API names five modes only.
+  API has only five modes.
 
 Does not model: loading and storing programs, popups, time, log, support files.
 """

@@ -90,7 +90,7 @@ class Path(Protocol):
 
     duration_s: float
     real_time: bool
-    """Whether speed slider and limiter are ignored."""
+    """Whether the speed slider and the limiter are ignored."""
 
     def begin(self, q: Vector6, qd: Vector6, /) -> None:
         """Plan the motion from the current set-point: angles (rad) and speeds (rad/s). Sets `duration_s`."""
@@ -296,7 +296,7 @@ class Servo:
 
 
 class HandMove(JointMove):
-    """A motion by the hand of the operator: like movej, but independent of slider and limiter."""
+    """A motion by the operator's hand: like movej, but independent of the slider and the limiter."""
 
     real_time = True
 

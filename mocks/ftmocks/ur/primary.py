@@ -23,7 +23,7 @@ Chosen here, where the sources are silent:
 * Kinematics and configuration come in the first state of a connection only, the parts that are not modelled in each.
 * C210 has argument 0, level warning and no text, and goes to the client that sent the program.
 * A run-time error is the message of an exception with line, column and text, then ``PROGRAM_XXX_STOPPED``. It has the
-  place of the call, else of the statement.
+  position of the call, else of the statement.
 * A program that may not start now (robot or safety mode) is dropped, and nothing is sent.
 * A safety mode is sent when it changes, with code, argument and data 0.
 * The checksum of a joint is the CRC-32 of its parameters; a nominal arm has all bits set, as URSim.

@@ -77,7 +77,7 @@ class Device(ABC, Generic[Frame]):
         Thread-safe function that returns n noisy readings (n, 6), N and N·m, in sensor axes. It is called once per
         sample.
     seed, faults
-        Random seed and faults of the wire.
+        Random seed, and faults of the wire.
     clock
         Clock of the cell; None creates one.
     saturated_axis
@@ -119,7 +119,7 @@ class Device(ABC, Generic[Frame]):
         """
 
     def unplug(self) -> None:
-        """Close the wire, as if the cable was pulled: the next read or write of the client fails."""
+        """Close the wire, as if the cable had been pulled: the next read or write of the client fails."""
         if not self._threads:
             return
         os.write(self._wake_write, _END)

@@ -31,7 +31,7 @@ class Faults:
     byte_slip
         One byte of a frame is lost (serial and UDP).
     swap
-        A frame is exchanged with the next one of the same answer (CAN) or of the stream (UDP).
+        A frame is swapped with the next one of the same answer (CAN) or of the stream (UDP).
     foreign
         A frame of another node precedes it (CAN).
     delay_s, jitter_s

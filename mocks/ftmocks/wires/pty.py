@@ -28,7 +28,7 @@ from ftmocks.wires.uart import marked
 
 @dataclass(eq=False)
 class PtyDevice(Device[Frame]):
-    """Base of the emulated serial and CAN sensors: opening, unplugging, reading, and writing that never blocks.
+    """Base class of the emulated serial and CAN sensors: opening, unplugging, reading, and writing that never blocks.
 
     `dropped_frames` counts the frames for which the terminal had no room, because the client does not read.
     """

@@ -10,7 +10,7 @@ Chosen here:
   to watch its client keeps the cell's time. `sleep` and motions keep the time of the arm: where that is K times faster,
   a loop of `servoj` without `sync` runs K times in a cycle.
 * `tool_contact` reports the cycle in which a force of `CONTACT_N` opposes the direction; the history of the joints ends
-  with the present reading.
+  with the current reading.
 * `movec` moves to its end along a straight line. A TCP that is named, instead of given as a pose, is the active one.
 
 Does not model: every other function (its name is a compile error), blends (a radius is taken as 0), force mode,
@@ -263,7 +263,7 @@ def get_actual_joint_positions(program: Caller) -> list[float]:
 
 
 def get_actual_joint_positions_history(program: Caller, steps: Value = 0) -> list[float]:
-    """Return the joint angles of some cycles ago, rad; the emulator returns the present ones."""
+    """Return the joint angles of some cycles ago, rad; the emulator returns the current ones."""
     whole_number(steps, "get_actual_joint_positions_history: steps", 0, 2**31 - 1)
     return get_actual_joint_positions(program)
 
@@ -309,7 +309,7 @@ def tool_contact(program: Caller, direction: Value = None) -> int:
 
 
 def get_forward_kin(program: Caller, q: Value = None, tcp: Value = None) -> Pose:
-    """Return the pose of the TCP in base at joint angles, by default the present ones."""
+    """Return the pose of the TCP in base at joint angles, by default the current ones."""
     robot = program.robot
     at = robot.measured_q if q is None else joints(q, "get_forward_kin: q")
     return Pose(pose_of(_base_tcp(robot, at, tcp)))
@@ -323,7 +323,7 @@ def get_inverse_kin(
     maxOrientationError: Value = 1e-10,
     tcp: Value = None,
 ) -> list[float]:
-    """Return the joint angles (rad) nearest to `qnear`, by default to the present ones, for a pose of the TCP."""
+    """Return the joint angles (rad) nearest to `qnear`, by default to the current ones, for a pose of the TCP."""
     number(maxPositionError, "get_inverse_kin: maxPositionError")
     number(maxOrientationError, "get_inverse_kin: maxOrientationError")
     near = None if qnear is None else joints(qnear, "get_inverse_kin: qnear")
@@ -402,7 +402,7 @@ def set_gravity(program: Caller, d: Value) -> None:
 
 
 def zero_ftsensor(program: Caller) -> None:
-    """Use the present wrench as zero."""
+    """Use the current wrench as zero."""
     program.robot.zero_ft()
 
 

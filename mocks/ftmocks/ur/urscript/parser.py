@@ -9,8 +9,8 @@ Chosen here: one statement per line, as in the manual. Operators have Python's p
 The parser rejects what a published report says that a controller rejects. Where another source contradicts the report,
 it accepts the text and records a doubt. The list with its sources: docs/reference/urscript-constructs.md.
 
-Does not model: structs, matrices, ``^``, ``switch``, ``assert``, remote procedure calls. Such a text is rejected as not
-emulated.
+Does not model: structs, matrices, ``^``, ``switch``, ``assert``, remote procedure calls. Such a program is rejected as
+not emulated.
 """
 
 from collections.abc import Collection, Iterator
@@ -62,7 +62,7 @@ class _Names:
     valued: set[str] = field(default_factory=set)
     loops: int = 0
     blocks: int = 0
-    """Numbers of loops, and of blocks of any kind, around the present statement."""
+    """Numbers of loops, and of blocks of any kind, around the current statement."""
 
 
 def parse(text: str, name: str, built_in: Collection[str]) -> tuple[Function, list[str]]:

@@ -17,8 +17,8 @@ Chosen here, where the manual is silent:
 * Everything ends with the main program. ``return`` ends a thread, whatever its value is.
 * A condition must be True or False. A variable keeps its type, of which all numbers have one, and a list its length.
   What a function returns keeps its type: see docs/reference/urscript-constructs.md for the reports.
-* A thread that never stops computing in one cycle is a run-time error. The manual continues it in the next cycle, and
-  warns of a lost connection to the controller.
+* A thread that never stops computing in one cycle is a run-time error. According to the manual it
+  continues in the next cycle, and the connection to the controller may be lost.
 """
 
 from collections.abc import Generator
