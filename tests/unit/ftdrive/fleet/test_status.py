@@ -59,6 +59,16 @@ def test_a_tool_out_of_use_is_not_listed_for_ever() -> None:
     assert [state.tool for state in one.cells] == ["gripper", "new", "older"]  # configured, newest, verified
 
 
+def test_due_counts_from_the_last_verification_whatever_its_outcome() -> None:
+    made = result("a", 30)
+    cells = [cell("a", verify_every_days=10.0)]
+    (one,) = fleet(cells, [made]).cells
+    assert (one.verified, one.passed, one.due) == (None, None, NOW - timedelta(days=20))
+    (one,) = fleet(cells, [made], [check(made, 12), check(made, 4, passed=False, temperature_C=31.0)]).cells
+    assert (one.verified, one.passed, one.change) == (NOW - timedelta(days=4), False, "bias")
+    assert (one.due, one.is_due(NOW), one.temperature_C) == (NOW + timedelta(days=6), False, 31.0)
+
+
 def test_a_verification_of_an_earlier_calibration_does_not_count() -> None:
     old, new = result("a", 30), result("a", 3)
     (one,) = fleet([cell("a")], [old, new], [check(old, 1)]).cells

@@ -18,7 +18,7 @@ from markupsafe import escape
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
-from ftcalib.accuracy import error_map, tip_of
+from ftcalib.accuracy import error_map, orientations, tip_of
 from ftcalib.errors import BadCalibration, BadDataset
 from ftcalib.model import predict
 from ftcalib.result import MotionResult
@@ -207,6 +207,14 @@ def test_the_error_map_follows_from_the_covariance() -> None:
     assert biased["torque_Nm"]["largest"] == pytest.approx(0.004)
 
 
+def test_the_map_names_the_direction_of_flange_z() -> None:
+    R = orientations(np.radians([-90.0, 0.0]), np.radians([0.0, 90.0]))
+    np.testing.assert_allclose(R[0, :, :, :, 2], np.broadcast_to([0, 0, -1], (2, 12, 3)), atol=1e-12)
+    np.testing.assert_allclose(R[1, 1, :, :, 2], np.broadcast_to([0, 1, 0], (12, 3)), atol=1e-12)
+    tilted = facts_of(Subject(Path("poses.csv"), with_covariance({2: 0.01**2}), ""))["error_map"]["force_N"]
+    assert "z" not in tilted["words"]
+
+
 def test_a_contact_has_the_sigma_of_its_sensor_with_and_without_loads() -> None:
     usual = SensorMatrix.usual()
     made = {"created_utc": "2026-11-20T08:00:00+00:00"}
@@ -254,6 +262,16 @@ def test_a_moved_centre_of_mass_is_the_only_group_that_changed() -> None:
     assert found["parameters"][9]["sigmas"] == pytest.approx(8)
     assert not found["same_data"]
     assert comparison_facts(before, before)["same_data"]
+
+
+def test_parameters_known_in_both_are_not_tested() -> None:
+    before = with_covariance({6: 0.01**2, 9: 1e-8})
+    step = np.zeros(15)
+    step[[6, 9]] = 0.01, 1e-4
+    found = comparison_facts(replace(before, parameters=before.parameters.moved(step)), before)
+    assert [group["name"] for group in found["groups"]] == ["force bias", "centre of mass", "all"]
+    assert found["parameters"][0]["sigmas"] is None
+    assert found["groups"][-1]["dof"] == 2
 
 
 def test_the_worst_of_many_poses_are_shown() -> None:

@@ -34,6 +34,16 @@ def reading_of(view: View) -> ShownWrench:
     return view.reading
 
 
+def test_numbers_are_the_mean_of_the_last_tenth_of_a_second() -> None:
+    rig = Rig(FakeStream("contact"))
+    rig.run(23)
+    last, _ = rig.feed.subscribe()
+    rig.feed.step(10)
+    view = rig.summary.view()
+    np.testing.assert_allclose(reading_of(view).wrench, np.concatenate([block.wrench for block in last]).mean(axis=0))
+    np.testing.assert_allclose(reading_of(view).raw, np.concatenate([block.raw for block in last]).mean(axis=0))
+
+
 def test_a_recording_that_goes_back_between_two_drawings_leaves_nothing_in_the_mean() -> None:
     rig = Rig(FakeStream("contact", block_s=0.05))
     rig.feed.step(240)  # in contact, with 5 N
