@@ -259,3 +259,19 @@ def test_an_arm_by_a_urdf_is_less_exact_unless_it_is_declared(
     host: str | None, declared: float | None, assumed: float | None
 ) -> None:
     assert orientation_accuracy_deg(host, declared) == assumed
+
+
+@pytest.mark.parametrize(
+    ("line", "cure"),
+    [
+        ("[site]\ng_m_s2 = '9.81'", "a number: give one such as"),
+        ("[sampling]\nattempts = 1.5", "a whole number: give one such as 1,"),
+        ("[workcell]\nmounting = true", "a string: put it in quotes"),
+        ("[workcell]\nmeasured = 1", "true or false: give one of them"),
+        ("[tool]\ncylinders_mm = [0, 60, 90]", r"such as \[\[0, 60, 90\]\]"),
+    ],
+)
+def test_a_wrong_type_says_what_to_give(line: str, cure: str) -> None:
+    Path("ftdrive.toml").write_text(f"{GOOD}{line}\n")
+    with pytest.raises(ConfigError, match=cure):
+        load()

@@ -366,3 +366,20 @@ def test_events_stand_where_they_happened_also_after_a_conversion(paths: Sequenc
     assert found[MARK.text] == [str(t) for t in t_ns[t_ns > MARK.t_host_ns]]
     assert found[GAP.text] == [str(t) for t in t_ns[t_ns > GAP.t_host_ns]]
     assert found["at the last sample"] == found["…"] == []
+
+
+def test_mcap_ros2_reads_the_messages(paths: Sequence[Path]) -> None:
+    rows = load_recording(paths[0]).rows
+    with paths[0].open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        attachments = {one.name: one for one in reader.iter_attachments()}
+        summary = reader.get_summary()
+        first_ns = int(rows["t_host_ns"][1400]) + UTC_OFFSET_NS
+        found = list(reader.iter_decoded_messages(["/ft_compensated"], starting_at=first_ns, log_time_order=True))
+    assert attachments.keys() == {"calibration.json", "recording.json"}
+    assert json.loads(attachments["calibration.json"].data) == info().calibration.to_dict()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_start_time == rows["t_host_ns"][0] + UTC_OFFSET_NS
+    assert len(summary.chunk_indexes) == 11  # fifths of a second; the new frame ends one early
+    assert [decoded.wrench.force.x for *_, decoded in found] == rows["wrench"][1400:, 0].tolist()
