@@ -102,7 +102,7 @@ def test_step_mode_moves_at_each_enter_and_a_completed_plan_may_run_by_itself(
     payload, lean = found["payload_mismatch"], found["base_leans"]
     assert (answer["verdict"], answer["hints"]) == ("usable", [])
     assert (payload["payload_kg"], payload["load_kg"]) == (1.5, pytest.approx(0.651, abs=0.01))
-    assert lean["lean_deg"] == pytest.approx(1.63, abs=lean["sigma_deg"])
+    assert lean["lean_deg"] == pytest.approx(1.63, abs=3 * lean["sigma_deg"])  # the noise is another in each run
     assert lean["side"] == "+y"  # gravity has a share along +y: alpha is 1.59°
     # The same posture gives the same plan, which has run to its end now.
     again = ftdrive.json("calibrate", "--config", config, "--minimal", "--fast", "--yes")
