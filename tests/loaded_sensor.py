@@ -65,9 +65,7 @@ class LoadedSensor:
         share = w / RANGE
         return np.asarray(w + w @ self.E.T + RANGE * (self.powers[0] * share**2 + self.powers[1] * share**3))
 
-    def dataset(
-        self, n: int, masses: Sequence[tuple[float, Array]], *, hung: bool, pull: "Pull | None" = None
-    ) -> CalibrationDataset:
+    def dataset(self, n: int, masses: Sequence[tuple[float, Array]], *, hung: bool) -> CalibrationDataset:
         """Return n poses with masses (kg) at places (3,) from the sensor origin, the tool among them."""
         rng = self.rng
         given = _hanging(n, rng) if hung else Rotation.random(n, rng=rng)
@@ -75,8 +73,6 @@ class LoadedSensor:
         u = self.gravity @ true
         M, s = sum(m for m, _ in masses), sum((m * p for m, p in masses), np.zeros(3))
         w = np.concatenate([M * u, np.cross(s, u)], axis=1)
-        if pull is not None:
-            w = w + pull.wrench(true)
         y = self.read(w)
         sensed = np.concatenate([part @ self.R_flange_sensor for part in np.split(w, 2, axis=1)], axis=1)
         y[1:] -= self.hysteresis * np.diff(sensed, axis=0)
@@ -111,19 +107,6 @@ class LoadedSensor:
         torque = np.cross(place_m, force) + torque_Nm * _directions(n, self.rng)
         w = np.concatenate([force, torque], axis=1)
         return w, self.read(w)
-
-
-@dataclass(frozen=True)
-class Pull:
-    """A constant force at a place, in base axes."""
-
-    force_base_N: Array
-    place_m: Array
-
-    def wrench(self, R_base_flange: Array) -> Array:
-        """Return it (n, 6) in flange axes."""
-        force = self.force_base_N @ R_base_flange
-        return np.concatenate([force, np.cross(self.place_m, force)], axis=1)
 
 
 def _directions(n: int, rng: np.random.Generator) -> Array:

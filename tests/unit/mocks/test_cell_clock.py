@@ -43,10 +43,6 @@ class Client:
         self._page[self._at] = os.getpid() if pid is None else pid
 
     @property
-    def published_ns(self) -> int:
-        return self._page[1]
-
-    @property
     def pid(self) -> int:
         return self._page[self._at]
 

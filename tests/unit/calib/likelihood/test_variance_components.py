@@ -27,7 +27,7 @@ from ftcalib.likelihood.variance_components import (
 from ftcalib.model import Array
 
 SLOPE_FORCE, SLOPE_TORQUE = channel_component("slope", FORCE), channel_component("slope", TORQUE)
-WALK_FORCE, WALK_TORQUE = channel_component("walk", FORCE), channel_component("walk", TORQUE)
+WALK_FORCE = channel_component("walk", FORCE)
 WHITE_FORCE, WHITE_TORQUE = channel_component("white", FORCE), channel_component("white", TORQUE)
 
 N = 15

@@ -362,11 +362,6 @@ class ControlInMemory(ControlProcess):
         far.clock.at(far.control_delay_s, answer)
         far.clock.at(self._timing.unwatched_s, watch)
 
-    def die(self) -> None:
-        """End by itself, as after SIGSEGV in ur_rtde."""
-        self._process.kill()
-        self._ended = True
-
     def kill(self) -> None:
         super().kill()
         self._ended = True
