@@ -254,6 +254,7 @@ LEANING = replace(LEVEL, gravity_force_base_N=Rotation.from_rotvec([0.05, 0, 0])
 UP = Setup(up_in_base=(-LEANING.gravity_force_base_N).tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "known", "truth", "setup", "code"),
     [
@@ -442,6 +443,7 @@ def test_a_real_session_gives_the_published_answer(method: Method) -> None:
     assert ("force_error" in codes(result)) == (method == "lrom")
 
 
+@pytest.mark.slow
 def test_a_real_session_with_drift_is_not_called_good() -> None:
     result: CalibrationResult = solve(real("foamcutting_2013_06_12"))
     assert result.verdict == "rejected"
@@ -488,6 +490,7 @@ def test_raw_counts_beside_standard_errors_in_newtons_are_named(recwarn: pytest.
     assert not recwarn.list
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["lrom", "carlson-polynomial"])
 def test_a_gain_is_named_and_no_second_solution(method: Method) -> None:
     """Sensors whose gains differ by 3 %: their minima lie 180° apart and far from each other."""

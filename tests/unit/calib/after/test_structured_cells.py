@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from ftcalib import CalibrationDataset, CalibrationResult, mean_and_covariance, solve
@@ -44,6 +45,7 @@ def calibrated(seed: int, name: str) -> Session:
     return Session(cell, data, result, float(t[-1]))
 
 
+@pytest.mark.slow
 def test_a_cable_does_not_fail_a_verification_in_poses_that_the_wrist_did_not_reach() -> None:
     cell, data, result, end_s = calibrated(506, "cable")
     q = postures(np.random.default_rng([506, 11]), 6, "whole")
@@ -52,6 +54,7 @@ def test_a_cable_does_not_fail_a_verification_in_poses_that_the_wrist_did_not_re
     assert verify_calibration(result, flange(q), y, cov, fitted=data).passed
 
 
+@pytest.mark.slow
 def test_a_heavier_tool_is_accepted_where_the_response_depends_on_the_load() -> None:
     """Of four poses of another tool in the unchanged cell."""
     cell, _, earlier, end_s = calibrated(508, "load")

@@ -102,6 +102,7 @@ def test_a_sensor_that_is_zeroed_before_each_move_reads_differences() -> None:
     assert finding.code == "zeroed_each_pose"
 
 
+@pytest.mark.slow
 def test_equal_readings_of_a_simulator_do_not_hide_its_mistake() -> None:
     """Without noise, with the centre of mass on the axis, so that tz is 0, and orientations in steps of 30°."""
     angles = np.radians([180, 0, 0] + 30 * np.random.default_rng(1).integers(-2, 3, (16, 3)))
@@ -127,6 +128,7 @@ def test_columns_of_force_and_torque_that_were_exchanged_are_named() -> None:
     assert first(R, np.roll(wrench, 3, axis=1)).code == "columns_swapped"
 
 
+@pytest.mark.slow
 def test_coarse_and_saturated_readings_are_named() -> None:
     _, R, wrench = session(1)
     coarse = first(R, np.round(wrench))
@@ -150,6 +152,7 @@ def test_a_wrench_of_the_neighbouring_pose_is_named() -> None:
     assert (finding.code, finding.values["neighbour"]) == ("pairing_shifted", "before")
 
 
+@pytest.mark.slow
 def test_wrenches_of_other_poses_are_named() -> None:
     _, R, wrench = session(3)
     assert first(R, wrench[::-1]).code == "pairing_or_rotations"
@@ -205,6 +208,7 @@ def test_axes_permuted_in_both_are_named_where_the_mounting_is_known() -> None:
     assert (finding.code, finding.values["corrections"]) == ("known_mounting", [["wrench", ["z", "x", "y"]]])
 
 
+@pytest.mark.slow
 def test_a_mistake_is_named_before_known_values_that_it_contradicts() -> None:
     p, R, wrench = session(4)
     known = Known(R_flange_sensor=p.R_flange_sensor, mass_kg=2.04, mass_tolerance_kg=0.01)
@@ -221,6 +225,7 @@ def test_a_wrench_in_base_axes_is_named() -> None:
     assert first(R, in_base + SIGMA * np.random.default_rng(1).normal(size=in_base.shape)).code == "constant_force"
 
 
+@pytest.mark.slow
 def test_a_channel_that_is_stuck_and_rows_that_were_copied_are_named() -> None:
     _, R, wrench = session(6)
     rows = np.append(np.arange(11), 3)

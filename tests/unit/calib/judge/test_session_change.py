@@ -86,6 +86,7 @@ def test_poses_count_as_they_were_taken_not_as_they_stand() -> None:
     assert result.findings[0].values["pose"] == np.flatnonzero(rows == 12)[0] + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("after", "code"), [(TARED, "bias_stepped"), (OTHER, "sensor_changed")])
 def test_other_changes_are_named_before_the_drift_that_they_look_like(after: Parameters, code: str) -> None:
     result = session(after, 13, seed=4, measured=False)
@@ -103,6 +104,7 @@ def test_a_tool_that_turns_with_its_sensor_is_named_with_its_angle() -> None:
     assert first.values["turn_deg"] == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_rows_of_two_sensors_are_named() -> None:
     assert session(OTHER, slice(1, None, 2), seed=1).findings[0].code == "sensors_alternate"
 
@@ -114,6 +116,7 @@ def test_a_run_that_was_tared_is_not_refused() -> None:
     assert np.abs(sigmas(result, TOOL)[sure]).max() < 4.5
 
 
+@pytest.mark.slow
 def test_a_random_walk_is_no_step() -> None:
     walk = np.cumsum(10 * SIGMA * np.random.default_rng(1).normal(size=(24, 6)), axis=0)
     found = {one.code for one in session(TOOL, 12, 1, added=walk, measured=False).findings}
@@ -167,6 +170,7 @@ def zeroed(places: list[int], seed: int, n: int = 24) -> CalibrationResult:
     return solve(CalibrationDataset.of(R, wrench, t_s=np.arange(float(n))))
 
 
+@pytest.mark.slow
 def test_every_zeroing_is_named_with_its_pose_and_nothing_that_it_explains() -> None:
     result = zeroed([4, 9], 5, 12)
     assert result.verdict != "good"
@@ -209,6 +213,7 @@ def test_errors_that_have_a_structure_are_no_change(seed: int) -> None:
     assert not named & {*KINDS, "sensors_alternate"}
 
 
+@pytest.mark.slow
 def test_a_change_is_named_from_some_of_many_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     n, looked_at, sizes = 1800, 150, list[int]()
 

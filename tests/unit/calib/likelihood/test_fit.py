@@ -189,6 +189,7 @@ def drifting(rng: np.random.Generator, n: int, kind: str) -> tuple[Parameters, A
     return p.moved(np.concatenate([np.zeros(6), end[:3], np.zeros(3), end[3:]])), R, wrench, bias
 
 
+@pytest.mark.slow
 def test_a_drifting_bias_is_followed() -> None:
     turned, covered, changes = [], [], []
     for seed in range(3):

@@ -82,6 +82,7 @@ def test_nothing_is_found_in_a_sensor_without_error() -> None:
     assert found <= 1
 
 
+@pytest.mark.slow
 def test_few_poses_do_not_show_it_and_it_counts_as_that_of_usual_sensors() -> None:
     distances = []
     for seed in range(10):

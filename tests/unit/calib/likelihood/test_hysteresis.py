@@ -44,6 +44,7 @@ def test_columns_are_the_lag_of_each_axis_behind_its_last_swing() -> None:
     assert hysteresis_columns(TRUTH, np.tile(np.eye(3), (FEW + 1, 1, 1))).shape[2] == 6
 
 
+@pytest.mark.slow
 def test_it_is_found_and_the_sigmas_hold() -> None:
     z, shares, seeds = [], [], 6
     for seed in range(seeds):

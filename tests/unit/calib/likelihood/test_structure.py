@@ -48,6 +48,7 @@ def test_what_cable_and_arm_do_in_the_middle_is_part_of_bias_and_mounting() -> N
     np.testing.assert_allclose(columns["kinematics"] @ coefficients, expected, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["load", "cable"])
 def test_sigmas_hold_where_an_error_has_a_structure(kind: str) -> None:
     squares = []

@@ -18,6 +18,7 @@ def solved(sensor: LoadedSensor, runs: list[LoadRun]) -> LoadSolution:
     return solve_loads(runs, USUAL, tool_mass_kg=sensor.weighed_tool_kg())
 
 
+@pytest.mark.slow
 def test_contacts_are_decoded_within_their_sigma() -> None:
     sensor = LoadedSensor(7)
     runs = sensor.runs(PROTOCOLS["bar, gripped twice"])
@@ -47,6 +48,7 @@ def test_the_gradient_of_the_likelihood_is_right() -> None:
     np.testing.assert_allclose(model.evaluate(y, linear).gradient, costs, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "row", "changed"),
     [
@@ -61,6 +63,7 @@ def test_a_wrong_declaration_is_named_first(code: str, row: int, changed: dict[s
     assert solution.verdict == "rejected"
 
 
+@pytest.mark.slow
 def test_exchanged_places_are_named() -> None:
     sensor = LoadedSensor(10)
     few = [replace(one, poses=n) for one, n in zip(PROTOCOLS["hung, side and tip"], (10, 6, 6), strict=True)]
@@ -69,6 +72,7 @@ def test_exchanged_places_are_named() -> None:
     assert [one.code for one in solved(sensor, runs).findings] == ["loads_swapped"]
 
 
+@pytest.mark.slow
 def test_a_touch_in_two_poses_is_named_with_the_poses() -> None:
     sensor = LoadedSensor(11)
     runs = sensor.runs(PROTOCOLS["hung, side and tip"])

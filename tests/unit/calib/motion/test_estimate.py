@@ -211,6 +211,7 @@ def test_a_delay_is_found_roughly_beside_contact() -> None:
     assert rough_delay(rows, None, G) == pytest.approx(0.03, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_walk_of_the_bias_is_found() -> None:
     rows = rows_of(400, load_of(Truth()), seed=5, turn_rad=0.6, sigma=4 * SIGMA)
     steps = np.random.default_rng(6).normal(size=(400, 6)) * np.sqrt(ROW_S)

@@ -80,6 +80,7 @@ def test_turns_and_lever_are_derivatives() -> None:
         np.testing.assert_allclose(lever_columns(load, motion)[:, :, axis], expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_sweep_gives_all_that_motion_shows(result: CalibrationResult) -> None:
     motion = result.motion
     assert motion is not None
@@ -93,6 +94,7 @@ def test_a_sweep_gives_all_that_motion_shows(result: CalibrationResult) -> None:
     assert np.abs(step).max() < 4
 
 
+@pytest.mark.slow
 def test_contact_is_left_out_and_listed() -> None:
     joints, stops = programme(4, 20.0)
     touched = {(start + 0.1, end): np.r_[0, 0, -6.0, 0.1, 0, 0] for start, end in stops[1::2]}
@@ -107,6 +109,7 @@ def test_contact_is_left_out_and_listed() -> None:
     assert "contacts_left_out" in {one.code for one in result.findings}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "code"),
     [
@@ -120,6 +123,7 @@ def test_wrong_data_are_named(swept: Recorded, change: object, code: str) -> Non
     assert found.verdict != "good"
 
 
+@pytest.mark.slow
 def test_another_rate_of_one_clock_is_named_and_undone(swept: Recorded) -> None:
     ratio = 1.02
     found = solve_motion(*means_of(replace(swept, t_s=3.0 + ratio * swept.t_s)))
@@ -128,6 +132,7 @@ def test_another_rate_of_one_clock_is_named_and_undone(swept: Recorded) -> None:
     assert not {"clock_offset", "clock_rate"} & {one.code for one in found.findings}
 
 
+@pytest.mark.slow
 def test_of_ten_poses_a_second_the_rests_count() -> None:
     """Fast moves between rests; the times of both streams are off by up to the jitter."""
     rng, jitter_s = np.random.default_rng(5), 0.04
@@ -153,6 +158,7 @@ def test_too_few_poses_without_rests_are_refused() -> None:
         solve_motion(*fast)
 
 
+@pytest.mark.slow
 def test_a_motion_about_one_axis_determines_nothing() -> None:
     with pytest.raises(NotObservable, match=r"last joint.*turn wrist 1"):
         solve_motion(*means_of(record(TRUTH, sweep(6.0, (0, 0, 1.5)), 6.0, 1)))
@@ -167,6 +173,7 @@ def test_known_values_determine_what_the_motion_does_not() -> None:
     assert not found.motion.inertia_kg_m2.any()
 
 
+@pytest.mark.slow
 def test_without_positions_slow_parts_count() -> None:
     joints, _ = programme(3, 25.0)
     found = solve_motion(*means_of(record(TRUTH, joints, 25.0, 3), positions=False))

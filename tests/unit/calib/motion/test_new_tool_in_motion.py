@@ -50,6 +50,7 @@ def test_an_earlier_result_adds_what_it_knows(earlier: CalibrationResult) -> Non
     assert CalibrationResult.from_dict(joined.to_dict()).id == joined.id
 
 
+@pytest.mark.slow
 def test_gain_and_cross_talk_are_kept() -> None:
     rng = np.random.default_rng(1)
     gain, cross_talk_m = (np.tensordot(0.02 * rng.normal(size=len(basis)), basis, 1) for basis in (GAIN, CROSS_TALK_M))
@@ -59,6 +60,7 @@ def test_gain_and_cross_talk_are_kept() -> None:
     assert np.abs((found.force_gain - gain) / found.sigma["force_gain"]).max() < 4
 
 
+@pytest.mark.slow
 def test_what_holds_no_more_is_named(earlier: CalibrationResult) -> None:
     gravity_m_s2 = Rotation.from_rotvec([2, 0, 0], degrees=True).apply(OLD.gravity_m_s2)
     with pytest.raises(NotObservable, match="the base has tilted, by 2°"):

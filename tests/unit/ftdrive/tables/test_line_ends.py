@@ -39,7 +39,8 @@ def test_no_line_end_and_nothing_above_the_names_loses_a_row(name: str, tmp_path
     path.write_text(content, newline="")
     expected = rows_of(path, name)
     assert len(expected) in (24, 600, 1200)
-    for (end, above), encoding in zip(product(ENDS.values(), ABOVE.values()), cycle(ENCODINGS), strict=False):
+    ways = zip(product(ENDS.values(), ABOVE.values()), cycle(ENCODINGS), strict=False)
+    for (end, above), encoding in list(ways)[sorted(CASES).index(name) % 5 :: 5]:  # all of them in five tables
         path.write_bytes((above + content).replace("\n", end).encode(encoding))
         np.testing.assert_array_equal(rows_of(path, name), expected)
 
