@@ -32,6 +32,7 @@ def run(run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch) -> Callable[..
     return partial(run, "fleet", "solve")
 
 
+@pytest.mark.slow
 def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(
     run: Callable[..., Ran], tmp_path: Path
 ) -> None:

@@ -47,6 +47,7 @@ def sensor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LoadedSensor:
     return LoadedSensor(3)
 
 
+@pytest.mark.slow
 def test_a_matrix_is_saved_beside_the_cell_and_used_for_its_sensor_alone(sensor: LoadedSensor) -> None:
     runs = sensor.runs(PROTOCOLS["hung, side and tip"])
     save(runs)
@@ -83,6 +84,7 @@ def test_later_loads_begin_with_the_earlier_matrix_and_can_be_dropped(sensor: Lo
     assert [path.name for path in sensor_files()] == ["sensor.json"]
 
 
+@pytest.mark.slow
 def test_nothing_is_saved_if_the_runs_do_not_agree(sensor: LoadedSensor) -> None:
     save(with_load(sensor.runs(PROTOCOLS["hung, tip"]), 1, mass_kg=4.4, mass_sigma_kg=0.001))
     found = run("solve", "tool.json", "tip.json", "--tool-mass", "1.300±0.002")

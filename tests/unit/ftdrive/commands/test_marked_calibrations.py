@@ -86,6 +86,7 @@ def emulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CalibrationResu
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("emulated")
 def test_every_output_of_an_emulated_calibration_says_so(
     run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch

@@ -53,6 +53,7 @@ def test_the_result_is_that_of_the_run_and_replaces_nothing(tmp_path: Path) -> N
     assert solved_path(folder).read_bytes() == solve_run(folder)
 
 
+@pytest.mark.slow
 def test_a_run_in_motion_is_solved_here_and_from_its_files_to_the_same_bytes(tmp_path: Path) -> None:
     folder = swept_run(tmp_path, "swept")
     assert again(folder).keys() == {folder}

@@ -41,6 +41,7 @@ def hooks(q_rad: Array) -> Array:
     return certifier().arm.hook_m(certifier().arm.frames(q_rad))
 
 
+@pytest.mark.slow
 def test_the_arm_turns_about_the_hook() -> None:
     q = plan().nodes_rad
     assert len(q) == HUNG_POSES
@@ -50,6 +51,7 @@ def test_the_arm_turns_about_the_hook() -> None:
     assert np.linalg.norm(between - hooks(q[:1]), axis=1).max() < 0.065
 
 
+@pytest.mark.slow
 def test_the_tilts_are_reached_from_those_about_another_hook() -> None:
     q_rad = np.radians([-36.0, -59.0, -111.0, -129.0, 17.0, 76.0])
     tilts_rad = Calibrating(CELL, SessionOptions(Path())).plan(certifier(), q_rad, 24).nodes_rad

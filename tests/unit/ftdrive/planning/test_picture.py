@@ -30,6 +30,7 @@ def plan() -> Plan:
     return plan_tour(certifier, poses=6, speeds=Speeds(), guess=guess_of(certifier))
 
 
+@pytest.mark.slow
 def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     figures = pytest.importorskip("matplotlib.figure")
     saved = list[Any]()

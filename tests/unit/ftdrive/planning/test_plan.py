@@ -68,6 +68,7 @@ def test_figures_of_the_constant_tour(model: str) -> None:
     assert max(one["motion_time_s"] for one in slower) <= 62
 
 
+@pytest.mark.slow
 def test_poses_of_a_new_tool_spread_gravity_like_a_tetrahedron(monkeypatch: pytest.MonkeyPatch) -> None:
     certifier = certifier_of()
     plan = plan_for(CELL, certifier, USUAL_POSTURE_RAD, TOOL_POSES)

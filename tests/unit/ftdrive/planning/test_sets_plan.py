@@ -34,6 +34,7 @@ def test_each_number_has_an_orientation_of_its_set() -> None:
         assert off.argmin() < 24  # the first that are reachable
 
 
+@pytest.mark.slow
 def test_wrong_sets_are_refused() -> None:
     with pytest.raises(ConfigError, match="no set 'X'"):
         plan_for(CELL, CERTIFIER, USUAL_POSTURE_RAD, sets="X")

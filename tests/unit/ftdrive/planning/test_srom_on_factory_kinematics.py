@@ -1,6 +1,7 @@
 """SROM on arms whose kinematics are their own: its orientations are accepted, and it loses little against LROM."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib.model import Array, Parameters, predict
@@ -29,6 +30,7 @@ def square_error(found: Parameters, truth: Parameters) -> float:
     return float(np.mean(np.sum(off[:, :3] ** 2, axis=1)))
 
 
+@pytest.mark.slow
 def test_fifty_arms_are_accepted_and_lose_at_most_a_fifth_against_lrom() -> None:
     """A tour that is planned on nominal kinematics."""
     rng = np.random.default_rng(0)

@@ -149,6 +149,7 @@ def numbers(result: Any) -> Any:
     return np.concatenate([np.ravel(value) for value in asdict(result.parameters).values()])
 
 
+@pytest.mark.slow
 def test_a_bag_with_transforms_is_solved_from_its_motion(tmp_path: Path) -> None:
     (path,) = bag(tmp_path / "bag", plugin=StoragePlugin.MCAP, topics=TF).glob("*.mcap")  # a file of its own
     assert is_bag(path)

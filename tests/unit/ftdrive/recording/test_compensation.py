@@ -118,6 +118,7 @@ def test_a_frame_that_is_not_configured_leaves_no_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [0.0, 0.03])
 def test_the_bias_of_a_zeroed_sensor_is_estimated_with_an_honest_sigma(error: float) -> None:
     sensor = replace(SensorMatrix.usual(), source="loads", error=error * np.eye(6))

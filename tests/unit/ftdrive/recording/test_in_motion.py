@@ -40,6 +40,7 @@ def run(*arguments: object) -> dict[str, Any]:
     return document
 
 
+@pytest.mark.slow
 def test_a_recording_is_solved_from_its_motion(tmp_path: Path, swept: Recorded) -> None:
     rows = np.zeros(len(swept.t_s), ROW)
     rows["t_host_ns"], rows["seq"] = np.rint(swept.t_s * 1e9) + 10**12, np.arange(len(rows))

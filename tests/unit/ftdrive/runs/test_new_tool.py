@@ -50,6 +50,7 @@ def test_a_rejected_result_may_not() -> None:
         require_same_cell(replace(earlier(), findings=(rejected,)), {})
 
 
+@pytest.mark.slow
 def test_a_run_in_motion_is_solved_with_the_earlier_result_that_it_keeps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

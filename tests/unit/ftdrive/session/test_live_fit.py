@@ -164,6 +164,7 @@ def name(stop: int) -> str:
     return f"R{TOUR[stop - 1]:02d}"
 
 
+@pytest.mark.slow
 def test_nothing_is_said_of_quiet_runs_and_inexact_arms_and_no_pose_is_named_where_the_sensor_wanders() -> None:
     def rough(_: int, R: Array, rng: np.random.Generator) -> Array:
         return predict(TRUTH, R @ Rotation.from_rotvec(rng.normal(size=3) * 0.002).as_matrix())
@@ -183,6 +184,7 @@ def test_nothing_is_said_of_quiet_runs_and_inexact_arms_and_no_pose_is_named_whe
         assert hint.code == "sensor_drifts"
 
 
+@pytest.mark.slow
 def test_a_cable_that_pulls_in_three_poses_is_named_with_them() -> None:
     pull = np.array([0.3, 0.2, 0.4, 0.01, -0.03, 0.03])
     found = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop in {5, 6, 14}) * pull))

@@ -97,6 +97,7 @@ def passively(cell: Any, folder: Path, seconds: float) -> Run:
     return run
 
 
+@pytest.mark.slow
 def test_it_ends_by_itself_when_the_result_is_good(free: Recorded, tmp_path: Path) -> None:
     cell = FakeCell(free)
     run = passively(cell, tmp_path, SECONDS)
@@ -117,6 +118,7 @@ def test_q_and_the_time_end_it_and_too_little_is_not_kept(free: Recorded, tmp_pa
         passively(FakeCell(free, stop_s=2.0), tmp_path, SECONDS)
 
 
+@pytest.mark.slow
 def test_what_was_recorded_before_a_failure_is_kept_and_solved(
     free: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

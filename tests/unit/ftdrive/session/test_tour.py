@@ -64,6 +64,7 @@ def test_the_first_run_is_slow_whatever_was_asked_and_the_second_may_be_fast(lab
     assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
 
 
+@pytest.mark.slow
 def test_a_plan_for_any_speed_is_driven_at_no_more_than_is_allowed(lab: Lab) -> None:
     certifier = certifier_for(lab.cell, "UR5e")
     speeds = Speeds(float(np.radians(180)), float(np.radians(80)), None)

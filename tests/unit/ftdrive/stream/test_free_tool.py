@@ -170,6 +170,7 @@ def test_the_offset_of_a_free_tool_is_another_one_after_a_turn_and_a_tare_can_be
     np.testing.assert_allclose(tracker.offset(systematic, np.eye(3))[0], here)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_N_h", [0.0, 20.0])
 def test_the_rate_of_a_drift_has_an_honest_sigma_and_is_reported_once(rate_N_h: float) -> None:
     squares, reported = [], 0

@@ -237,6 +237,7 @@ def test_a_stream_is_opened_by_the_name_of_a_tool(tools: Cell) -> None:
         open_stream(tools.config, tools.calibration, tool="drill")
 
 
+@pytest.mark.slow
 def test_the_tool_is_switched_while_the_devices_stay_open(tools: Cell) -> None:
     tools.sensor.motion = tools.arm.motion = Motion()
     with open_stream(tools.config, tool="drill", stages=Stages(lowpass_Hz=200.0)) as stream:

@@ -83,6 +83,7 @@ def test_a_matrix_that_is_no_rotation_is_named(R: str, words: str, tmp_path: Pat
         csv(tmp_path, ROW, f"{IDENTITY},1,2,3,4,5,6", f"{R},1,2,3,4,5,6").dataset()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sign", [1, -1])
 def test_an_imu_on_the_tool_serves_as_orientation(sign: int) -> None:
     up = POSES.R.inv().apply([0.0, 0.0, 1.0])

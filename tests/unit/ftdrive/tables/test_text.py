@@ -40,6 +40,7 @@ def test_a_number_may_be_written_in_several_ways(line: str, tmp_path: Path) -> N
     assert share == 1.0
 
 
+@pytest.mark.slow
 def test_a_long_table_is_read_in_parts_up_to_its_fault(tmp_path: Path) -> None:
     path = tmp_path / "w.csv"
     rows = np.c_[np.arange(60_000) / 1000, np.random.default_rng(3).normal(0, 10, (60_000, 6))]

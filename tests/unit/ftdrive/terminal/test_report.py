@@ -65,6 +65,7 @@ def test_the_headline_promises_no_error_that_the_residuals_refute(method: Method
     assert ("not measured" in error_source(result)) != measured
 
 
+@pytest.mark.slow
 def test_what_was_given_wrongly_is_named_with_what_the_data_say() -> None:
     finding = solve(tilted(), known=Known(mass_kg=0.61)).findings[0]
     assert finding.code == "known_mass"

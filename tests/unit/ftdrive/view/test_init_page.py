@@ -70,6 +70,7 @@ def form(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[Form]:
     assert made.described.cell().sensor.height_mm == 33
 
 
+@pytest.mark.slow
 def test_no_answer_ends_the_form(form: Form) -> None:
     for key in (WALLS, BOXES):
         form.enter(f"{key} add")
