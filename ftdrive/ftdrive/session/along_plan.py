@@ -63,7 +63,7 @@ def _parse_entry(line: str) -> dict[str, object]:
 
 
 class _SafetyQuestions:
-    """Asks about free tool, free space, emergency stop and reduced mode; raises `Declined` if an answer is no."""
+    """Asks about the free tool, free space, emergency stop and reduced mode; raises `Declined` if an answer is no."""
 
     def __init__(self, before: Before) -> None:
         self._arm, self._journal = before.cell.arm, before.cell.journal
@@ -137,7 +137,7 @@ class AlongPlan:
         for record in kept.values():
             cell.journal.show(self.judge.add(record))
         self.before = self._look(certifier, plan)
-        """Everything known before the first motion, with the plan at its own speeds."""
+        """Everything known before the first motion, with the plan at its original speeds."""
         run_checks(self.before, CHECKS)
         if self.options.dry_run:
             cell.note("the controller's safety limits are not checked: only a program on the controller can do that")
@@ -184,7 +184,7 @@ class AlongPlan:
         return before
 
     def end_dry_run(self) -> None:
-        """Keep the page of the plan open until the operator presses Enter."""
+        """Keep the plan page open until the operator presses Enter."""
         if self._onlookers:
             self.cell.journal.ask(Question("The page shows the plan until you press Enter", ("",)))
 
@@ -196,7 +196,7 @@ class AlongPlan:
         predict: Callable[[Array], Array | None],
         *onlookers: guards.Guard,
     ) -> Iterator[tuple[GuardedCell, PoseBook]]:
-        """Ask the safety questions, then guard the cell during the block; yields the guarded cell and the pose book.
+        """Ask the safety questions, then guard the cell during the block; yield the guarded cell and the pose book.
 
         `driven` has the speeds and the sampling of this session. `quiet_std` (6,) is the standard deviation of the
         samples of the resting sensor, and `predict` is as in `Judge`. The `onlookers` are called after the guards.
@@ -231,7 +231,7 @@ class AlongPlan:
                 if before.certifier.arm.hung is not None:
                     words = "Is the weight off the tool? You hang it when the arm is at the first pose."
                     cell.journal.require(words, assumed=before.known and not options.real)
-                questions.ask(way, assumed=before.known and not arm_moves(way))  # approaches that move the arm are new
+                questions.ask(way, assumed=before.known and not arm_moves(way))  # a moving approach is new
             run = self._session.resumed or self._keep_plan()
             book = PoseBook(cell, run, self.judge, before.certifier.scene.down_base)
             guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)

@@ -63,7 +63,7 @@ class Progress:
     confirmed: bool = False
     """Whether the operator has typed the word that starts the first motion."""
     taken_last: int | None = None
-    """Stop of the pose taken last."""
+    """Stop of the last pose taken."""
     skipped: set[int] = field(default_factory=set)
     """Indices of the skipped poses, whose postures the arm should avoid."""
     reopened: set[int] = field(default_factory=set)
@@ -159,14 +159,14 @@ class GuardedCell:
         self._contact, self._recheck = contact, recheck
         self._sensor_events = SensorEvents(cell.sensor, cell.journal.show)
         self._cause: Tripped | None = None  # why the arm holds
-        self._answered: Tripped | None = None  # last stop of row 11 after which the safety questions were answered
+        self._answered: Tripped | None = None  # last row 11 stop after which the safety questions were answered
 
     def show_new(self) -> None:
         """Show new events of the sensor."""
         self._sensor_events.show_new()
 
     def cause(self, error: Exception, *, moving: bool) -> Tripped | None:
-        """Return the trip that caused an error: of a guard, or one with the matching hazard; None if there is none."""
+        """Return the trip that caused an error: a guard's, or one with the matching hazard; None if there is none."""
         self.watcher.unseen = False
         self._cause = self._row_of(error, moving=moving)
         if self._cause is not None:
@@ -199,7 +199,7 @@ class GuardedCell:
             self._contact.forget()
             self._sensor_events = SensorEvents(self.cell.sensor, self.cell.journal.show)
         stop = self.watcher.safety_stop
-        if stop is not None and stop not in {self._answered, self._cause}:  # a stop while the arm already held
+        if stop is not None and stop not in {self._answered, self._cause}:  # a stop while the arm was already holding
             self._cause = stop
             self.cell.journal.show(GuardTripped(hazard=stop.hazard, words=str(stop)))
         elif unseen:
@@ -268,7 +268,7 @@ class Drive:
         self.arm, self.sensor, self.journal = guarded.cell.arm, guarded.cell.sensor, guarded.cell.journal
         self.note = guarded.cell.note
         self.certifier = driven.certifier
-        """Certifier for the present tool, with or without its hanging load; it plans the approaches."""
+        """Certifier for the current tool, with or without its hanging load; it plans the approaches."""
         # Whether `--yes` may answer: this arm has completed the plan before, or the cell is emulated.
         self.trusted = driven.known
         self.nodes_rad = driven.plan.nodes_rad
@@ -276,7 +276,7 @@ class Drive:
         self._options, self._numbers, self._obey = options, numbers, obey
 
     def obey_keys(self) -> None:
-        """Obey the pressed keys: r refers to the pose taken last, s to the pose in progress, as on the screen.
+        """Obey the pressed keys: r refers to the last pose taken, s to the pose in progress, as on the screen.
 
         Every key stops a moving arm and takes effect after the stop. Keys are read before the screen shows another
         pose.
@@ -387,8 +387,8 @@ class Drive:
     def hold(self, error: Exception, choices: Callable[[int | None, str], tuple[str, Mapping[str, str]]]) -> str:
         """Stop the arm, show the cause, and ask the operator; return the answer when the arm may go on.
 
-        `choices` is called with the index of the pose to which the arm can return, and with words about the cause. It
-        returns a sentence about the saved data, and the effect of each possible answer.
+        `choices` is called with the index of the pose to which the arm can return, and with a description of the cause.
+        It returns a sentence about the saved data, and the effect of each possible answer.
         """
         # First of all, stop the arm.
         self.arm.stop()
@@ -431,7 +431,7 @@ class Drive:
             return answer
 
     def _choose(self, question: Question, end: Exception) -> str:
-        """Ask how to go on; raise `end`, the original cause, if the operator quits or does not answer."""
+        """Ask how to continue; raise `end`, the original cause, if the operator quits or does not answer."""
         try:
             answer = self.journal.ask(question)
         except SupervisorGone as gone:

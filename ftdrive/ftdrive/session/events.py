@@ -1,4 +1,4 @@
-"""Events of a session, which the terminal shows and the journal records, and the rows of the hazard table."""
+"""Rows of the hazard table, and the events of a session, which the terminal shows and the journal records."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
@@ -103,7 +103,7 @@ class StateChanged(Event):
     number: int | None = None
     """Number of the orientation."""
     words: str = ""
-    """Cause of a STOP or HOLD; otherwise what happens or what to do."""
+    """Cause of a STOP or HOLD; otherwise what is happening or what to do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -126,7 +126,7 @@ class Planned(Event):
     """Joint vectors (k + 1, 6) of the approach to the first pose; (0, 6) if the arm stands there."""
     way_words: str
     stop_words: str = ""
-    """Stopping distance of the arm, in words; empty for an arm of another package."""
+    """Stopping distance of the arm, in words; empty for an arm whose driver comes from another package."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the object that `--json` writes, with the plan as in its file."""
@@ -176,9 +176,9 @@ class MotionRecorded(Event):
     file: str
     duration_s: float
     samples: int
-    """Samples of the sensor."""
+    """Number of samples from the sensor."""
     states: int
-    """States of the arm."""
+    """Number of states reported by the arm."""
     temperature_C: float | None = None
     """Temperature that the sensor reports; None if it does not."""
 
@@ -197,10 +197,10 @@ class Estimated(Event):
     residual_force_N: float | None
     """Norm of the residual force of the newest pose."""
     faces: tuple[int, int, int, int, int, int]
-    """Numbers of poses whose gravity is nearest to each flange axis: +x -x +y -y +z -z."""
+    """Number of poses whose gravity direction is nearest to each flange axis: +x -x +y -y +z -z."""
     cond9: float
     cond_u1: float
-    """Condition numbers of the poses, see `ftcalib.poses.information.Prediction`."""
+    """Condition numbers of the poses; see `ftcalib.poses.information.Prediction`."""
     empty_cap_deg: float
     """Largest angle from any direction to the nearest direction of gravity among the poses."""
     light: str
@@ -224,12 +224,12 @@ class Compared(Event):
     light: str
     """Whether the poses suffice: "green" or "amber"."""
     hint: str = ""
-    """What to do if the pose is too near to a pose of the calibration; else empty."""
+    """What to do if the pose is too near to a pose of the calibration; otherwise empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Weighed(Event):
-    """The identified mass, when the running fit is reliable, and the payload set in the controller."""
+    """The identified mass, once the running fit is reliable, and the payload set in the controller."""
 
     mass_kg: float
     """Mass that the sensor carries, without sensor and adapter."""
@@ -260,7 +260,7 @@ class Asked(Event):
 
 
 class SensorEvents:
-    """Shows each event of a sensor once, such as interruptions and reconnections."""
+    """Shows each event of a sensor once, such as an interruption or a reconnection."""
 
     def __init__(self, sensor: ForceTorqueSensor, show: Callable[[Event], None]) -> None:
         self._sensor, self._show = sensor, show
@@ -322,14 +322,14 @@ class Operator(Protocol):
         """Return one of the answers to a question; raises `Declined` or `SupervisorGone` if no operator can answer."""
 
     def absence(self) -> str | None:
-        """Return why no operator follows, such as a closed terminal; None if one does. Callable from any thread."""
+        """Return why no operator is following, such as a closed terminal; None if one is. Callable from any thread."""
 
     @property
     def has_keys(self) -> bool:
         """Whether keys are read; hints about keys are shown only then."""
 
     def pressed(self) -> Key | None:
-        """Return the oldest key that was not returned yet, or None, at once."""
+        """Return the oldest key not yet returned, or None, without waiting."""
 
     @property
     def pressed_by(self) -> str:

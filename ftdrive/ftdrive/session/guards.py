@@ -1,8 +1,8 @@
 """Guards that watch the arm while the program controls it; `watchdog.py` runs them in a thread.
 
 Each guard covers rows of the hazard table in docs/reference/hazards.md, which also names the test of each row. A guard
-judges one `Seen` and raises `Tripped`. No guard is a safety function: safety is the task of the robot's safety system
-and of the user's risk assessment.
+judges one observation, `Seen`, and raises `Tripped`. No guard is a safety function: safety is the task of the robot's
+safety system and of the user's risk assessment.
 """
 
 from abc import ABC, abstractmethod
@@ -60,9 +60,9 @@ class Limits:
     """Time between the joint angles and the flange pose of one state."""
     sensor_age_moving_s: float = 0.1
     sensor_age_holding_s: float = 0.5
-    """Largest time without a new sample while the arm moves and while it stands."""
+    """Longest time without a new sample while the arm moves, and while it stands."""
     frozen_samples_s: float = 0.2
-    """Largest time for which all samples may be equal."""
+    """Longest time for which all samples may be equal."""
     saturation: float = SATURATION
     """Largest allowed share of the sensor's range."""
     contact_N: float = 8.0
@@ -79,13 +79,13 @@ class Limits:
     look_s: float = 0.01
     """Period of the guards, s."""
     counted_s: float = 0.02
-    """Upper bound of the time counted between two looks, so that a pause of this process trips no other guard."""
+    """Upper bound on the time counted between observations, so that a pause of this process trips no other guard."""
     aside_s: float = 0.05
     """Period at which the safety status is read while no motion is watched."""
     blind_s: float = 1.0
     """Time without a status after which an emergency stop may have been pressed and released unnoticed."""
     hung_s: float = 1.0
-    """Time without a look after which the guards are considered to hang."""
+    """Time without an observation after which the guards are considered hung."""
     slow_stop_s: float = 0.2
     """A stop that takes longer is reported before it has ended. A responsive arm brakes from 60 deg/s in 0.2 s."""
     link_usual_s: float = 0.02
@@ -133,12 +133,12 @@ class ExpectedMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """One look at arm and sensor."""
+    """One observation of the arm and the sensor."""
 
     t_s: float
-    """Time of the look on the clock of the cell."""
+    """Time of the observation on the clock of the cell."""
     dt_s: float
-    """Time since the previous look, at most `Limits.counted_s`."""
+    """Time since the previous observation, at most `Limits.counted_s`."""
     motion: ExpectedMotion
     state: ArmState
     status: ArmStatus
@@ -147,19 +147,19 @@ class Seen:
     sample: int
     """Sequence number of that sample."""
     turn_rad_s: float
-    """Angular speed of the flange between the previous look and this one."""
+    """Angular speed of the flange between the previous observation and this one."""
 
 
 class Guard(ABC):
     """Watches one row of the hazard table, or several rows with the same signal."""
 
     def begin(self, seen: Seen) -> None:
-        """Take this look as the reference; it is the first of a session, or the first after the operator resumes."""
+        """Take this observation as the reference: it is the first of a session, or the first after a resume."""
         del seen  # most guards need no reference
 
     @abstractmethod
     def look(self, seen: Seen) -> None:
-        """Raise `Tripped` if this look shows the hazard."""
+        """Raise `Tripped` if this observation shows the hazard."""
 
 
 @dataclass
@@ -167,11 +167,11 @@ class SupervisorGuard(Guard):
     """Row 27: an operator, or a program in their place, follows the session."""
 
     absence: Callable[[], str | None]
-    """Reason why no operator follows, or None, as `Operator.absence`."""
+    """Returns why no operator follows, or None, like `Operator.absence`."""
 
     def look(self, seen: Seen) -> None:
         """Trip if the operator is absent."""
-        del seen  # a look does not show the operator
+        del seen  # an observation does not show whether an operator follows
         if why := self.absence():
             raise Tripped(Hazard.SUPERVISOR_GONE, SupervisorGone(why))
 
@@ -214,7 +214,7 @@ class StallGuard(Guard):
     _goal_rad: Array | None = field(default=None, init=False)
 
     def look(self, seen: Seen) -> None:
-        """Time how long the arm makes no progress: towards the goal, or on a curve in any direction."""
+        """Measure how long the arm makes no progress: towards the goal, or on a curve in any direction."""
         goal = seen.motion.goal_rad
         if seen.motion.curve_rad is not None:
             if self._on_curve is None or np.abs(seen.state.q_rad - self._on_curve).max() > _PROGRESS_RAD:
@@ -268,7 +268,7 @@ class ModelGuard(Guard):
     certifier: Certifier
 
     def look(self, seen: Seen) -> None:
-        """Check the flange pose of this look."""
+        """Check the flange pose of this observation."""
         self.judge(seen.state)
 
     def judge(self, state: ArmState) -> None:
@@ -374,7 +374,7 @@ class SensorGuard(Guard):
         self._wrench, self._same_s, self._same = None, 0.0, 0
 
     def look(self, seen: Seen) -> None:
-        """Time how long no sample arrives, or all samples are equal."""
+        """Measure how long no sample arrives, or all samples are equal."""
         if not np.isfinite(seen.wrench).all():
             raise fault(Hazard.SENSOR_LOST, f"the sensor sent {seen.wrench.tolist()}: check its cable and power")
         if seen.sample == self._sample:
@@ -429,7 +429,7 @@ class RangeGuard(Guard):
 
 @dataclass
 class ContactGuard(Guard):
-    """Rows 14 and 1 of the hazards: the sensor carries only the weight of the tool."""
+    """Rows 14 and 1: the sensor carries only the weight of the tool."""
 
     limits: Limits
     heaviest_kg: float

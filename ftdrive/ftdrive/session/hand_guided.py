@@ -23,7 +23,7 @@ from ftdrive.session.open_session import OpenCell, OpenSession, PoseBook
 from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmState, FtSamples
 
-# Standstill before a pose, s on the controller's clock, by joint speeds: `is_steady` is always false in freedrive.
+# Standstill before a pose, s on the controller's clock, judged by joint speeds: in freedrive `is_steady` is false.
 STILL_S: Final = 1.0
 STILL_RAD_S: Final = 0.002
 # A rotation of the flange below this is a nudge, not a move.
@@ -37,7 +37,7 @@ BACK_S: Final = 12.0
 # A pose that differs from the fit of the others by more than both limits was probably disturbed by contact.
 SURPRISE_SIGMA: Final = 5.0
 SURPRISE_N: Final = 0.5
-# Least number of poses for the comparison of a new pose with the fit of the others, including the new one.
+# Smallest number of poses for the comparison of a new pose with the fit of the others, including the new one.
 LEAST_TO_COMPARE: Final = 6
 
 T = TypeVar("T")
@@ -105,8 +105,8 @@ def take_by_hand(session: OpenSession) -> Run:
 class HandGuided:
     """Takes poses at each standstill of the arm until they suffice.
 
-    Keys: keep ends the session when the light is green, stop ends it at once. Redo replaces the newest pose by the next
-    one, skip leaves out the present pose, pause pauses and resumes. A key takes effect within the averaging time.
+    Keys: keep ends the session when the light is green, stop ends it at once. Redo replaces the newest pose with the
+    next one, skip leaves out the current pose, pause pauses and resumes. A key takes effect within the averaging time.
     Without keys, the session ends with the first good pose that makes the light green.
 
     Parameters
@@ -210,7 +210,7 @@ class HandGuided:
             self._sensor_events.show_new()
 
     def _wait_out(self, ask: Callable[[], T], *losses: type[DeviceError]) -> T:
-        """Repeat `ask` until it succeeds, for `BACK_S` at most."""
+        """Repeat `ask` until it succeeds, for at most `BACK_S`."""
         deadline_s = self._clock.now_s() + BACK_S
         while True:
             try:
@@ -324,7 +324,7 @@ class HandGuided:
         return True
 
     def _deal_with(self) -> None:
-        """Finish the present pose; the next measurement needs another pose."""
+        """Finish the current pose; the next measurement needs another pose."""
         self._dealt_with = True
         words = "the program goes on" if self._listen else "move on to another orientation"
         if self._may_finish:

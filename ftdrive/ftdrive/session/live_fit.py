@@ -47,7 +47,7 @@ def free_wrench(result: CalibrationResult, R_base_flange: Array) -> Array:
 
 
 class RunningFit:
-    """Calibration from the poses so far, and their coverage.
+    """Calibration from the poses so far, and the coverage of these poses.
 
     `down_base` (3,) is the unit vector down in base until the fit estimates it. With `advise` the estimates suggest the
     most useful next pose. A known `load` is part of what the sensor carries.
@@ -220,7 +220,7 @@ def _pointing_down(gravity_flange: Array) -> str:
 
 
 def _light(coverage: Prediction, *, loaded: bool = False) -> str:
-    """Return the light: by conditioning, and never green for few poses or if another solution explains them."""
+    """Return the light by the conditioning; never green with few poses or if another solution explains them."""
     values = {"cond9": coverage.cond9, "cond_u1": coverage.cond_u1}
     if loaded:
         values = {name: values[name] for name in OF_A_LOAD}
@@ -231,7 +231,7 @@ def _light(coverage: Prediction, *, loaded: bool = False) -> str:
 
 
 def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[float, float] | None:
-    """Return the residual of a new pose in the fit of the earlier poses: sigmas of the worst channel, and norm in N."""
+    """Return the residual of a new pose in the fit of the earlier poses: worst channel in sigmas, force norm in N."""
     if result is None:
         return None
     R_base_flange = record.before.R_base_flange

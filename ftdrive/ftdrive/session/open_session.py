@@ -1,4 +1,4 @@
-"""Objects that every mode of a session uses: open cell, journal, task, judge, and the record of the poses."""
+"""Objects that every mode of a session uses: the open cell, journal, task, judge, and record of the poses."""
 
 import logging
 import threading
@@ -75,7 +75,7 @@ class SessionOptions:
     yes: bool = False
     """Answer the safety questions automatically, but never confirm the first motion of a new plan."""
     seconds: float = 20.0
-    """Duration of a sweep at the planned speed, or longest duration of a passive calibration."""
+    """Duration of a sweep at the planned speed, or maximum duration of a passive calibration."""
     description: Mapping[str, Any] = field(default_factory=dict)
     """Further entries of run.json."""
 
@@ -318,7 +318,7 @@ class OpenSession:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseBook:
-    """Writes the poses of a session to its run, shows and judges them."""
+    """Writes the poses of a session to its run, shows them and judges them."""
 
     cell: OpenCell
     run: Run

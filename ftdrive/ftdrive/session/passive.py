@@ -18,7 +18,7 @@ from ftdrive.session.open_session import OpenCell, OpenSession
 from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 
-# Duration of the first fit's data, s; each later fit has 25 % more.
+# Duration of the first fit's data, s; each later fit uses 25 % more.
 FIRST_S: Final = 10.0
 LONGER: Final = 1.25
 # Shortest useful recording, s.

@@ -42,7 +42,7 @@ _ROUNDED_RAD: Final = float(np.radians(1))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Before:
-    """Everything that is known before the first motion: the input of the checks."""
+    """Everything that is known before the first motion: the input to the checks."""
 
     cell: OpenCell
     config: CellConfig
@@ -72,7 +72,7 @@ class Before:
 
     @property
     def sensor_zero(self) -> Array:
-        """Reading (6,) from which the range is measured: that at rest if the sensor's zero is arbitrary, else 0."""
+        """Reading (6,) from which the range is measured: the one at rest if the sensor's zero is arbitrary, else 0."""
         is_arbitrary = self.cell.sensor.identify().has_arbitrary_zero
         return np.asarray(self.quiet.wrench.mean(axis=0) if is_arbitrary else np.zeros(6))
 
@@ -143,7 +143,7 @@ def _check_sensor(before: Before) -> Check:
 
 
 def _check_load(before: Before) -> Check:
-    """Check that tool weight and reading at rest fit into the range of the sensor."""
+    """Check that the tool weight and the reading at rest are within the range of the sensor."""
     limits, config = before.sensor_range, before.config
     is_arbitrary = before.cell.sensor.identify().has_arbitrary_zero
     rest = check_rest(before.quiet.wrench, limits, config, zero_is_arbitrary=is_arbitrary)
@@ -151,7 +151,7 @@ def _check_load(before: Before) -> Check:
 
 
 def _check_workcell(before: Before) -> Check:
-    """Check that tool and surroundings are described and measured; a warning of `doctor` is a failure here."""
+    """Check that the tool and its surroundings are described and measured; a warning of `doctor` is a failure here."""
     check = computer.check_workcell(before.config, before.certifier.arm.name)
     return check if check.state == "ok" else replace(check, state="failed")
 
@@ -179,7 +179,7 @@ def _check_approach(before: Before) -> Check:
 
 
 def check_cable(before: Before) -> Check:
-    """Check that wrist 3 stays within its window about the present angle, at which the cable is not wound up."""
+    """Check that wrist 3 stays within its window about the current angle, at which the cable is not wound up."""
     stands = before.cell.arm.state().q_rad[5]
     turns = [step.q_rad[5] for step in before.plan.steps]  # an approach stays between these angles
     low, high = min(turns), max(turns)

@@ -1,4 +1,4 @@
-"""Calibration of an emulated cell without questions, and changes of its load."""
+"""Calibration of an emulated cell without questions, and changes to its load."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -137,7 +137,7 @@ def rehearse_loads(
     operator: Callable[[], AbstractContextManager[Operator]],
     say: Callable[[str], object],
 ) -> LoadSolution:
-    """Take poses with a load at each of two hooks; return the sensor matrix solved from these and the tool's poses."""
+    """Take poses with a load at each of two hooks; return the sensor matrix solved from these and the tool poses."""
     truth = station.truth
     taken: list[tuple[Outcome, KnownLoad | None]] = [(tool, None)]
     for name, hook_mm in _HOOKS_MM.items():
@@ -164,9 +164,9 @@ def rehearse_loads(
 
 
 def contact_errors(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:
-    """Return the RMS force error of a contact of 100 N at the tip, N: as read, decoded, and the predicted sigma.
+    """Return RMS values for a contact of 100 N at the tip, N: force error as read and decoded, and predicted sigma.
 
-    The mean is over random directions. The reading comes from the true parameters, not from the solver's model.
+    The mean square is over random directions. The reading comes from the true parameters, not from the solver's model.
     """
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
     force = CONTACT_N * directions / np.linalg.norm(directions, axis=1, keepdims=True)

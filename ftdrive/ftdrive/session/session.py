@@ -39,7 +39,7 @@ from ftdrivers.registry import Options, split_url
 
 # Options in the address of a sensor that select its factory calibration, with their defaults.
 _CHOOSES_CALIBRATION: Final = {"slot": 0, "calibration": 1}
-# Facts about a sensor that depend on its scale or factory calibration.
+# Reported properties of a sensor that depend on its scale or factory calibration.
 _OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range", "software_bias")
 
 
@@ -86,7 +86,7 @@ def _require_same_devices(run: Run, config: SensorConfig, connected: Mapping[str
 
 
 def _meaning(config: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the settings and facts that define the scaling of a sensor: sign, factory calibration, scale and range."""
+    """Return the properties that define the scaling of a sensor: sign, factory calibration, scale and range."""
     options = Options(config["url"], split_url(config["url"]).query)
     chosen = {f"option {name}": options.integer(name, usual, 0, 255) for name, usual in _CHOOSES_CALIBRATION.items()}
     scale = {name: fact["value"] for name, fact in facts.items() if name in _OF_NUMBERS}
@@ -257,7 +257,7 @@ def describe_run(task: Task, options: SessionOptions, connected: Mapping[str, De
         "devices": {role: asdict(info) for role, info in connected.items()},
         "mode": options.mode,
         **({} if options.method == "ml" else {"method": options.method}),
-        **({"station": {}} if task.cell.is_emulated else {}),  # a cell of another process: its true values are unknown
+        **({"station": {}} if task.cell.is_emulated else {}),  # in another process: true values unknown
         **options.description,
     }
 

@@ -101,7 +101,7 @@ def _settings(values: Mapping[str, Any]) -> ControllerSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Push:
-    """Settings to send, with the present ones and the comparison that led to them."""
+    """Settings to send, with the current ones and the comparison that led to the new ones."""
 
     old: ControllerSettings
     new: ControllerSettings

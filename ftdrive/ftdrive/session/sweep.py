@@ -45,7 +45,7 @@ _UNSURE_N: Final = 2.5
 
 
 def take_sweep(session: OpenSession) -> Run | None:
-    """Record the free tool along a wrist curve about the present posture; return the run, or None after a dry run."""
+    """Record the free tool along a wrist curve about the current posture; return the run, or None after a dry run."""
     task, options = session.task, session.options
     along = AlongPlan(session, lambda certifier, q_rad: sweep_for(task.cell, certifier, q_rad, options.seconds))
     driven, sweep = _choose_speed(along.before, slow=options.real and not along.before.known)
@@ -62,7 +62,7 @@ def take_sweep(session: OpenSession) -> Run | None:
 
 
 def _repeat_until_recorded(drive: Drive, sweep: Sweep, sampling: Sampling, run: Run) -> None:
-    """Move the arm to the centre of the sweep and along the curve; repeat after a stop. Raises as `Tour.run`."""
+    """Move the arm to the centre of the sweep and along the curve; repeat after a stop. Raises as `Tour.run` does."""
     now = drive.now
     now.todo = [1]
     drive.watcher.begin()
@@ -143,7 +143,7 @@ class FreeToolPrediction(Guard):
     """Recursive least-squares fit of the wrench as a linear function of the gravity direction in flange axes.
 
     Force and torque of a free tool are linear in this direction for every mounting, weight, centre of mass and bias.
-    As a guard that never trips, the class receives each sample, updates the fit, and predicts for the contact guard.
+    The class is a guard that never trips: it updates the fit with each sample, and predicts for the contact guard.
     """
 
     down_base: Array
@@ -157,7 +157,7 @@ class FreeToolPrediction(Guard):
     _coefficients: Array = field(default_factory=lambda: np.zeros((4, 6)), init=False)
 
     def begin(self, _: Seen) -> None:
-        """Discard the fit, because tool and sensor zero may differ after a stop."""
+        """Discard the fit, because the tool and the sensor's zero may differ after a stop."""
         unknown = (self.heaviest_kg * STANDARD_GRAVITY_M_S2 / _NOISE_N) ** 2
         self._covariance = np.diag([unknown, unknown, unknown, 1e6])
         self._coefficients = np.zeros((4, 6))
@@ -206,7 +206,7 @@ def on_script_path(cell: CellConfig) -> CellConfig:
 
 
 def _choose_speed(before: Before, *, slow: bool) -> tuple[Before, Sweep]:
-    """Return plan and curve, slowed down as the speed slider now demands. Raises `NotAccepted` if it is too low."""
+    """Return plan and curve, slowed down as the speed slider now requires. Raises `NotAccepted` if it is too low."""
     cell, slider = before.cell, before.cell.arm.status().speed_slider
     if slider < LEAST_SLIDER:
         raise NotAccepted(

@@ -33,7 +33,7 @@ _TOOL_AVERAGES: Final = 2.0
 
 
 def take_tour(session: OpenSession) -> Run | None:
-    """Take the poses of a given plan, or of a plan from the present posture; return the run, None after a dry run."""
+    """Take the poses of a given plan, or of a plan from the current posture; return the run, None after a dry run."""
     options = session.options
     along = AlongPlan(session, lambda certifier, q_rad: session.task.plan(certifier, q_rad, options.poses))
     driven = _choose_pace(along)
@@ -252,7 +252,7 @@ class Tour:
         self._now.arrive(index, driven_from=driven_from)
 
     def _own_speed(self, index: int) -> float | None:
-        """Return the planned speed of the move from the present pose to another, rad/s; None if the plan lacks it."""
+        """Return the planned speed of the move from the current pose to another, rad/s; None if the plan lacks it."""
         at, n = self._now.at, len(self._nodes)
         if at is None or (index - at) % n not in {1, n - 1}:
             return None

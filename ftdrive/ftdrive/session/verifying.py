@@ -52,7 +52,7 @@ class Verifying:
     poses: int
     """Number of new poses to take."""
     runs: Path
-    """Folder of runs; the plan of an earlier verification is used again if it still fits the cell."""
+    """Folder of runs; the plan of an earlier verification is reused if it still fits the cell."""
 
     @staticmethod
     def chosen(
@@ -86,8 +86,8 @@ class Verifying:
         return cls(cell, calibration, path, options.poses, options.runs)
 
     def take(self, operator: Operator, limits: Limits, options: SessionOptions) -> Verified:
-        """Guide the operator through the poses; return the result of the verification. Raises as `take_poses`."""
-        # The run records calibration and options, so that --resume continues with them.
+        """Guide the operator through the poses; return the result of the verification. Raises as `take_poses` does."""
+        # The run records the calibration and the options, so that --resume continues with them.
         kept = {"path": str(self.path.absolute()), "poses": options.poses, "quick": options.fast}
         about = {**kept, "limits": dict(zip(("force_N", "torque_Nm"), limits, strict=True)), "id": self.calibration.id}
         run = take_poses(self, operator, replace(options, description={"verification": about, **options.description}))

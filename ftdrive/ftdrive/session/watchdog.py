@@ -61,7 +61,7 @@ class Watcher:
         self._thread.join(timeout=5.0)
 
     def begin(self) -> None:
-        """Forget the last trip, and let the guards take the next look as their reference."""
+        """Forget the last trip, and let the guards take the next observation as their reference."""
         self._tripped = self.report_error = None
         self._reported.clear()
         self._begun = False
@@ -70,7 +70,7 @@ class Watcher:
     def watching(
         self, start_rad: Array, goal_rad: Array, *, moving: bool, curve_rad: Array | None = None
     ) -> Iterator[None]:
-        """Run the guards during the block, which begins after their first look.
+        """Run the guards during the block, which begins after their first observation.
 
         A trip is raised before the block, after it, and by `check`. The arm moves straight in joint space, or along
         `curve_rad` (n, 6).
@@ -91,14 +91,14 @@ class Watcher:
         self.check()
 
     def look_aside(self) -> None:
-        """Look for row 11 stops while no motion is watched: a stop may be released before the operator answers.
+        """Check for row 11 stops while no motion is watched: a stop may be released before the operator answers.
 
         Shows nothing, because the screen may show a question.
         """
         with self._judging:
             try:
                 status = self._arm.status()
-            # An arm of another package may raise any error; reopening the arm reports the cause.
+            # An arm driver from another package may raise any error; reopening the arm reports the cause.
             except Exception as error:
                 log.debug("the arm reports no status: %r", error)
                 now_s = self.clock.now_s()
@@ -140,7 +140,7 @@ class Watcher:
         return self._tripped
 
     def turn(self) -> float:
-        """Run the guards once; return the time until the next look, s."""
+        """Run the guards once; return the time until the next run, s."""
         motion = self._motion
         if motion is None or self._tripped is not None:
             self.look_aside()
