@@ -370,7 +370,7 @@ def plan_tour(
     mass_kg : float, optional
         Mass of the tool for the predicted accuracy; default 1.
     posture_deg : sequence of 3 floats
-        Present angles of the first three joints.
+        Current angles of the first three joints.
 
     Raises
     ------

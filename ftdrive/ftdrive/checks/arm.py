@@ -21,7 +21,7 @@ from ftdrivers.errors import DeviceError, ModelUnknown
 from ftdrivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, RobotArm
 from ftdrivers.ur.kinematics import MODELS, kinematics_of
 
-# Largest allowed distance of the payload's centre outside the described tool.
+# Distance by which the payload's centre of mass may lie outside the described tool.
 _PAYLOAD_MM: Final = 100.0
 _LINK_S: Final = 0.5
 _CLOCK_S: Final = 1.0
@@ -149,7 +149,7 @@ def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) 
 
 
 def check_weighed_payload(payload_kg: float | None, result: CalibrationResult, sensor_kg: float | None) -> Check:
-    """Compare the controller's payload with the mass of a calibration plus `sensor_kg`, of sensor and adapter."""
+    """Compare the controller's payload with the mass of a calibration plus `sensor_kg` for sensor and adapter."""
     name = "robot.payload"
     if payload_kg is None:
         return Check(name, "skipped", "the controller does not report its payload")
@@ -193,7 +193,7 @@ def _answers_s(arm: RobotArm, clock: Clock) -> list[float]:
 
 
 def check_clock(arm: RobotArm, clock: Clock) -> Check:
-    """Compare the rates of the clocks of controller and computer, from differences of each clock alone."""
+    """Compare the clock rates of controller and computer, from time differences within each clock alone."""
     t_host_ns, t_device_s = list[int](), list[float]()
     try:
         with clock.keeping_up():
@@ -233,7 +233,7 @@ def check_flange(arm: RobotArm, status: ArmStatus) -> Check:
 def examine_arm(
     cell: CellConfig, stack: ExitStack, *, usual_s: float, gap_s: float
 ) -> tuple[list[Check], RobotArm | None]:
-    """Open the arm until `stack` ends, and return all checks without control, and the arm; None if it does not answer.
+    """Open the arm until `stack` ends; return all checks that need no control, and the arm, or None if it is silent.
 
     The times are as in `check_link`.
     """
@@ -303,7 +303,7 @@ def flange_load(
     jacobian[1:, 0:3] = share * skew(arm_m)
     jacobian[1:, 9:12] = share * result.R_flange_sensor
     covariance = jacobian @ result.tool_covariance @ jacobian.T
-    gain_variance = float(np.square(result.sigma["mass_kg"])) - covariance[0, 0]  # `sigma` contains the gain
+    gain_variance = float(np.square(result.sigma["mass_kg"])) - covariance[0, 0]  # `sigma` includes the gain
     covariance += max(gain_variance, 0.0) * np.outer(by_mass, by_mass)
     if p_flange_sensor_com_m is None:
         covariance[3, 3] += ((1 - share) * height_m) ** 2 / 12
@@ -312,7 +312,7 @@ def flange_load(
 
 
 def margin_in_words(mass_kg: float, model: str) -> str:
-    """Describe the margin of a mass to the rated payload of an arm."""
+    """Describe the margin between a mass and the rated payload of an arm."""
     rated_kg = RATED_KG.get(model)
     if rated_kg is None:
         return f"{mass_kg:.2f} kg; the rated payload of a {model} is unknown: compare with its data sheet"

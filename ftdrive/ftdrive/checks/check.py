@@ -33,7 +33,7 @@ def check_diagnosis(diagnosis: Diagnosis, device: str = "robot") -> Check:
 
 
 def verdict(checks: Sequence[Check]) -> State:
-    """Return the worst state of some checks."""
+    """Return the worst state among some checks."""
     states = {check.state for check in checks}
     return "failed" if "failed" in states else "warning" if "warning" in states else "ok"
 
@@ -96,7 +96,7 @@ def compare_devices(
 def check_calibration(
     result: "CalibrationResult", connected: Mapping[str, DeviceInfo], mount: str | EllipsisType | None = ...
 ) -> Check:
-    """Check that a calibration belongs to the connected devices and the mounting, see `compare_devices`."""
+    """Check that a calibration belongs to the connected devices and the mounting; see `compare_devices`."""
     name = "calibration.devices"
     belongs = compare_devices(result, connected, mount)
     if belongs.others:

@@ -139,7 +139,7 @@ def check_permissions(address: SensorAddress, *, sys: Path = SYS, dev: Path = DE
 
 
 def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[Check]:
-    """Check that a serial port exists and is accessible, its name survives replugging, and its latency is low."""
+    """Check that a serial port exists and is accessible, that its name survives replugging, and its latency is low."""
     if not dev.is_dir():
         return [Check("permissions.port", "skipped", f"not applicable: this system has no device files such as {port}")]
     if not port.exists():
@@ -212,7 +212,7 @@ def can_interfaces(sys: Path = SYS) -> list[str]:
 
 
 def can_details(interface: str) -> Mapping[str, Any]:
-    """Return kind, state and bitrate of a CAN interface as far as the command `ip` reports them."""
+    """Return the kind, state and bit rate of a CAN interface as far as the command `ip` reports them."""
     if (ip := shutil.which("ip", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")) is None:
         return {}
     command = [ip, "-details", "-json", "link", "show", interface]
@@ -229,7 +229,7 @@ def can_details(interface: str) -> Mapping[str, Any]:
 
 
 def check_can_interface(interface: str, bitrate: int, details: Mapping[str, Any], *, sys: Path = SYS) -> Check:
-    """Check that a CAN interface of the kernel exists, is up, not bus-off, and at the bitrate, by its `can_details`."""
+    """Check by `can_details` that a kernel CAN interface exists, is up, is not bus-off, and has the right bit rate."""
     name = "permissions.can"
     up = f"sudo ip link set {interface} up type can bitrate {bitrate}"
     if "/" in interface or interface.startswith("tty"):

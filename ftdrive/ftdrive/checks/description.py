@@ -1,6 +1,6 @@
-"""Description of a cell by answers: questions, meaning and checks of the answers, and their draft.
+"""Description of a cell by answers: the questions, the meaning and checks of the answers, and their draft file.
 
-Terminal, options, draft and page of `ftdrive init` all use `QUESTIONS`; an answer is a string in all of them.
+The terminal, options, draft and page of `ftdrive init` all use `QUESTIONS`; an answer is a string in all of them.
 """
 
 import json
@@ -125,7 +125,7 @@ class Description:
         self.answered: set[str] = set()
         """Keys whose question is answered."""
         self.reports: dict[str, str] = {}
-        """Reports of the devices about themselves, by the key of their address."""
+        """What the devices report about themselves, by the key of their address."""
         self.places: list[str] = []
         """Addresses at which sensors were found; the number of one of them is a valid answer."""
 

@@ -164,7 +164,7 @@ def check_sensor_error(name: str, error: DeviceError, address: SensorAddress, pe
 
 
 def _not_reached(error: BaseException) -> bool:
-    """Return whether the device sent nothing; an error about an unexpected answer has no cause."""
+    """Return whether the device sent nothing; an error about an unexpected answer has no `__cause__`."""
     silent = isinstance(error, DeviceTimeout | StreamBroken)
     return silent or (isinstance(error, ConnectError) and error.__cause__ is not None)
 
@@ -234,7 +234,7 @@ def _check_lost(health: Health, address: SensorAddress) -> Check:
     gone = max(health.lost, health.malformed, health.out_of_order)
     if not gone and not health.duplicated:
         return Check("sensor.lost", "ok", found)
-    state: State = "failed" if gone > 0.01 * health.received else "warning"  # duplicates are no losses
+    state: State = "failed" if gone > 0.01 * health.received else "warning"  # duplicates are not losses
     fix = "check the cable, its shield and the termination of the bus" if address.host is None else _BETTER_NETWORK
     if address.scheme == "ati-can":  # the sensor is polled
         fix += ", or run fewer programs on this computer: an answer that is read too late is also lost"

@@ -1,4 +1,4 @@
-"""The approach from the present posture to the first pose: a straight joint move if it is clear, else via poses.
+"""The approach from the current posture to the first pose: a straight joint move if it is clear, else via poses.
 
 Via poses come from a roadmap with lazy proofs (Bohlin and Kavraki, Path planning using lazy PRM, ICRA 2000). The
 shortest path through free poses is searched first, then its moves are certified, and moves that are not clear are
@@ -27,22 +27,22 @@ ROOM_RAD = np.radians([120.0, 90.0, 100.0, 120.0, 120.0, 0.0])
 AT_RAD = 1e-3
 NODES = 240
 NEIGHBOURS = 16
-# Largest number of rounds of proofs, which take about 1 s in all.
+# Maximum number of proof rounds, which take about 1 s in total.
 ROUNDS = 80
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """Consecutive moves, k in number, that end at the first pose; k is 0 if the arm is there already."""
+    """A sequence of k moves that ends at the first pose; k is 0 if the arm is already there."""
 
     way_rad: Array
-    """Joint vectors (k + 1, 6) from the present posture to the first pose; (0, 6) without a move."""
+    """Joint vectors (k + 1, 6) from the current posture to the first pose; (0, 6) without a move."""
     speed_rad_s: Array
     """Speed (k,) of the leading joint in each move."""
     certified: bool
     """Whether every move is proven clear; always true for the result of `plan_approach`."""
     clearance_m: float
-    """Lower bound of the clearance over all moves."""
+    """Lower bound on the clearance over all moves."""
     limited_by: str
     """The two bodies whose distance comes closest to the margin."""
 
@@ -52,7 +52,7 @@ class Approach:
         return self.way_rad[1:]
 
     def duration_s(self, most_rad_s: float, acceleration_rad_s2: float) -> float:
-        """Return the duration of the moves with speeds of at most `most_rad_s`, s."""
+        """Return the duration of the moves at speeds of at most `most_rad_s`, s."""
         turns = np.abs(np.diff(self.way_rad, axis=0)).max(axis=1)
         speeds = np.minimum(self.speed_rad_s, most_rad_s)
         return float(move_duration_s(turns, speeds, acceleration_rad_s2).sum())
@@ -64,7 +64,7 @@ def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, sp
     Parameters
     ----------
     q_now : array_like, shape (6,)
-        Present joint angles as reported, within one turn of zero, so that no move crosses a joint limit.
+        Current joint angles as reported, within one turn of zero, so that no move crosses a joint limit.
     q_first : array_like, shape (6,)
         First pose of the tour.
 
@@ -121,7 +121,7 @@ def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Spe
     np.fill_diagonal(possible, val=False)
     proven = np.zeros_like(possible)
     for _ in range(ROUNDS):
-        # The shortest-path trees of start and goal give the best path through every node. A batch of them is certified.
+        # The shortest-path trees of start and goal give the best path through every node. Batches are certified.
         distance, before = dijkstra(
             np.where(possible, cost, 0.0), directed=False, indices=[0, 1], return_predecessors=True
         )

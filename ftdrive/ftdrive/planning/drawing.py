@@ -27,7 +27,7 @@ _ALONG = 0.1
 # Every fifth step of a sweep is drawn.
 _OF_SWEEP = 5
 _FAR_M = 20.0
-# Largest distance of shown surroundings from arm and ball, and width of the border.
+# Largest distance from the arm and the ball to surroundings that are shown, and width of the border.
 _NEAR_M, _EDGE_M = 1.0, 0.06
 _TURN = np.linspace(0, 2 * np.pi, 100)
 
@@ -44,14 +44,14 @@ def draw_plan(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike =
     path : Path
         A new file.
     way_rad : array_like, shape (k + 1, 6), optional
-        The approach from the present posture to the first pose, drawn in green.
+        The approach from the current posture to the first pose, drawn in green.
 
     Raises
     ------
     ConfigError
         Matplotlib is not installed.
     OSError
-        As `write_new`.
+        Raised by `write_new`.
     """
     try:
         from matplotlib.figure import Figure
@@ -142,7 +142,7 @@ def _rims(part: Cylinder) -> Array:
 
 
 def _view_corners(plan: Plan, poses: Frames, before: Array, scene: Scene) -> Array:
-    """Return the low and high corner (2, 3) of the drawing: arm, ball, and near surroundings, base axes, m."""
+    """Return the low and high corners (2, 3) of the drawing: arm, ball, and near surroundings, base axes, m."""
     centre = np.array(plan.ball_centre_m)
     points = np.concatenate([_skeletons(poses).reshape(-1, 3), before, [centre - plan.ball_m, centre + plan.ball_m]])
     low, high = points.min(axis=0) - _NEAR_M, points.max(axis=0) + _NEAR_M

@@ -24,7 +24,7 @@ class Speeds:
 
     @classmethod
     def first_run(cls) -> "Speeds":
-        """Return the slow limits for a plan that was not completed in its workcell yet."""
+        """Return the slow limits for a plan that has not yet been completed in its workcell."""
         return cls(float(np.radians(30)), float(np.radians(40)))
 
     @classmethod
@@ -89,6 +89,6 @@ def tips(arm: ArmModel, q_rad: Array) -> Array:
 
 
 def arm_moves(way_rad: ArrayLike) -> bool:
-    """Return whether base, shoulder or elbow move along a path (n, 6)."""
+    """Return whether base, shoulder or elbow moves along a path (n, 6)."""
     path = np.asarray(way_rad)
     return len(path) > 0 and bool(np.ptp(path[:, :3], axis=0).max() >= STILL_RAD)

@@ -71,7 +71,7 @@ class Plan(Displayed):
     sweep: Sweep | None = None
     """Curve of a sweep, whose points are the steps; None for a tour."""
     off_curve_m: float = 0.0
-    """Bound of the loss of clearance on the curve relative to the straight moves between the steps."""
+    """Bound on the loss of clearance on the curve relative to the straight moves between the steps."""
 
     def _summary(self) -> Summary:
         return Summary(f"Plan {self.kind}, {counted(len(self.steps), 'pose')}", notes=_summary(self))
@@ -89,7 +89,7 @@ class Plan(Displayed):
 
     @property
     def measured(self) -> bool:
-        """Whether the operator has configured that tool and scene were measured; otherwise they may be placeholders."""
+        """Whether the configuration says that tool and scene were measured; otherwise they may be placeholders."""
         return self.description.get("measured") is True
 
     @property
@@ -174,7 +174,7 @@ class Plan(Displayed):
         return "\n".join([*self.why, *rest, *([*rows, ""] if table else []), *_summary(self)])
 
     def stop_in_words(self, robot: RobotConfig) -> str:
-        """Describe time and angle of a stop from the highest speed of the plan; empty for other drivers than "ur"."""
+        """Describe the time and angle of a stop at the highest speed of the plan; empty for other drivers than "ur"."""
         if robot.driver != "ur":
             return ""
         speed_deg_s, stop_deg_s2 = np.degrees(self.top_speed_rad_s), robot.stop_deceleration_deg_s2
@@ -192,7 +192,7 @@ class Plan(Displayed):
         return f"Wrist and tool stay {ball}, and the whole arm moves: keep the space of both clear and cables slack."
 
     def ball_in_words(self) -> str:
-        """Describe radius and centre of the ball."""
+        """Describe the radius and centre of the ball."""
         x, y, z = (f"{value:.2f}" for value in self.ball_centre_m)
         return f"within {self.ball_m:.2f} m of x {x}, y {y}, z {z} m in base"
 

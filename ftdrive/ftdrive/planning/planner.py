@@ -45,7 +45,7 @@ SPARE = 100
 # Upper limit of the speeds, even if a plan or an old configuration contains higher ones.
 FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
 
-# Assumed standard deviation of one axis of the mean of a pose, N and N·m.
+# Assumed standard deviation of the mean of a pose, per axis, N and N·m.
 _NOISE = 0.05, 0.003
 # A tour: numbers of the orientations and joint vectors (n, 6), in the order of travel.
 Found = tuple[Sequence[int], Array]
@@ -80,7 +80,7 @@ def plan_tour(
     Parameters
     ----------
     q_rad : array_like, shape (6,)
-        Present joint angles.
+        Current joint angles.
     poses : {24, 12, 6}
     guess : Guess
         Assumed tool and noise.
@@ -277,7 +277,7 @@ def plan_verification(
 
 
 def _start_nearest(q_now: Array, tour: Found) -> Found:
-    """Return a closed tour that starts nearest to the present joint angles, where the cable is least wound."""
+    """Return a closed tour that starts nearest to the current joint angles, where the cable is least wound."""
     numbers, q = tour
     nearest = -int(np.abs(q - q_now).max(axis=1).argmin())
     return np.roll(numbers, nearest).tolist(), np.roll(q, nearest, axis=0)
@@ -290,7 +290,7 @@ def _pose_numbers(poses: int) -> tuple[int, ...]:
 
 
 def _winds_little(q_rad: Array, q_now: Array) -> bool:
-    """Return whether joint 6 stays within its window about the present angle."""
+    """Return whether joint 6 stays within its window about the current angle."""
     return bool(np.abs(q_rad[:, 5] - q_now[5]).max() <= WRIST_6_RAD + 1e-9)
 
 
@@ -362,7 +362,7 @@ def plan_for(
 ) -> Plan:
     """Plan a tour for a cell and its certifier, starting near joint angles `q_rad` (6,).
 
-    Raises `PlanRefused` if too few poses are reachable by moves that are proven clear, `ConfigError` for wrong values.
+    Raises `PlanRefused` if too few poses are reachable by moves that are proven clear, `ConfigError` for bad values.
     """
     speeds, guess = speeds_of(cell), guess_of(certifier, cell)
     if tip_unlimited:
@@ -418,12 +418,12 @@ def certifier_for(
     p_flange_hook_m : (float, float, float), optional
         Point of the tool from which a load hangs on a string.
     must_be_possible : bool
-        Whether to refuse impossible cells, see `require_possible`; a drawing shows them.
+        Whether to refuse impossible cells (see `require_possible`); a drawing shows them.
 
     Raises
     ------
     ConfigError
-        Arm or tool are missing, a shape is impossible, the arm has no measured shape, or as `require_possible`.
+        The arm or the tool is missing, a shape is impossible, the arm has no measured shape, or see `require_possible`.
     """
     if model is None:
         raise ConfigError("the model of the arm is unknown: give --model, or set [robot] model in ftdrive.toml")

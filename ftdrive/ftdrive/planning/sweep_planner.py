@@ -67,7 +67,7 @@ def plan_sweep(
     stop_rad_s2: float,
     guess: Guess,
 ) -> Plan:
-    """Plan a sweep around the present posture, or around one with more room.
+    """Plan a sweep around the current posture, or around one with more room.
 
     The sweep takes `seconds` at the planned speed. Raises `ConfigError` if `seconds` is out of range, and `PlanRefused`
     if no sweep is proven clear.
@@ -95,7 +95,7 @@ def plan_sweep(
 
 
 def _centres(certifier: Certifier, q_now: Array) -> Iterator[Array]:
-    """Yield centres of the sweep: the present posture, then others of the wrist, then others of the arm."""
+    """Yield centres of the sweep: the current posture, then others of the wrist, then others of the arm."""
     yield q_now
     for turn in (np.pi / 2, -np.pi / 2):
         yield np.concatenate([q_now[:4], [turn], q_now[5:]])
@@ -179,7 +179,7 @@ def _times(sweep: Sweep, step_s: float) -> Array:
 
 
 def _off_curve(sweep: Sweep, stop_rad_s2: float) -> Array:
-    """Return a bound (6,) of the deviation of each joint from the straight moves between the points, rad."""
+    """Return a bound (6,) on the deviation of each joint from the straight moves between the points, rad."""
     stop_s = float(sweep.largest(1).max()) / stop_rad_s2
     return np.asarray(sweep.largest(2) * (PROOF_S**2 / 8 + SMOOTHED_S**2 / 2 + stop_s**2 / 8))
 
@@ -200,7 +200,7 @@ def predicted(arm: ArmModel, sweep: Sweep, guess: Guess) -> tuple[float, float, 
     prior = np.zeros(23)
     prior[INERTIA], prior[HEIGHT], prior[DELAY] = guess.mass_kg * GYRATION_M**2, HEIGHT_M, DELAY_S
     weight = np.divide(1.0, prior**2, out=np.zeros(23), where=prior > 0)
-    # A weak prior keeps directions finite that the motion does not determine.
+    # A weak prior keeps the sigma finite in directions that the motion does not determine.
     weight[:15] = 1e-6 / guess.scale**2
     covariance = np.linalg.inv(J.T @ J + np.diag(weight))
     force_N, torque_Nm = Calibrated(guess.parameters, covariance[:15, :15]).predicted_error()

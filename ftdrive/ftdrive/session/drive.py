@@ -242,7 +242,7 @@ class GuardedCell:
 
 
 class Drive:
-    """Moves the arm between the poses of a plan while the guards watch; certified moves and confirmed approaches only.
+    """Moves the arm between the poses of a plan under the guards: only certified moves and confirmed approaches.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ class ContactTest:
     """Squared Mahalanobis distance of each reading from the prediction for a free tool.
 
     A reading is the mean of the samples of the last `READING_S` seconds. Every sample completes a reading; only
-    readings without common samples are independent. The covariance contains the noise in the present state of motion
+    readings without common samples are independent. The covariance contains the noise in the current state of motion
     and the uncertainty of the calibration. In motion it also contains the error of the delay and, if inertia is not
     subtracted, an unknown acceleration. The limit follows Hotelling's T² distribution, because the noise is estimated
     from data.

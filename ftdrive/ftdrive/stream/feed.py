@@ -73,7 +73,7 @@ class Feed(Sink):
         self.push = push
         self.status = stream.status()
         self.sigma = self.rest_sigma = self.sample_sigma = np.full(6, np.nan)
-        """(6,) standard deviations: of a mean over `MEAN_S` under the present contact, of such a mean of a free tool,
+        """(6,) standard deviations: of a mean over `MEAN_S` under the current contact, of such a mean of a free tool,
         and of one sample of a free tool. Updated every 50 ms, like the status."""
         self.newest_ns: int | None = None
         """Time of the newest sample."""

@@ -1,6 +1,6 @@
 """Kalman filter for the residual of a free tool: bias, drift, local error of the calibration, and a held part.
 
-The state is x = (b, d, c, s): bias (6), drift rate of the bias (6), error of the calibration in the present orientation
+The state is x = (b, d, c, s): bias (6), drift rate of the bias (6), error of the calibration in the current orientation
 (6), mass of the part and mass times its centre of mass (4). Over dt seconds and a turn of the arm by phi, with a =
 exp(-phi / 0.5 rad) and the covariance S of the prediction of the calibration,
 
@@ -378,7 +378,7 @@ class FreeToolFilter:
         windows = [*(fit.window for fit in self._run), window]
         run = self._extended(self._run, [window]) if len(windows) <= _LONGEST_RUN else None
         while run is None:
-            # drop the older half, because the newest windows belong to the present part
+            # drop the older half, because the newest windows belong to the current part
             windows = windows[(len(windows) + 1) // 2 :]
             run = self._extended([], windows)
         self._run = run

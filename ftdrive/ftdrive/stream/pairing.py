@@ -290,7 +290,7 @@ class Pairing:
         return self._estimator.sigma_s if self._estimator else 0.0
 
     def use(self, estimator: DelayEstimator) -> None:
-        """Use an estimator with another calibration, and keep the present delay; a configured delay stays."""
+        """Use an estimator with another calibration, and keep the current delay; a configured delay stays."""
         if self._estimator is not None:
             estimator.delay_s, estimator.sigma_s = self._estimator.delay_s, self._estimator.sigma_s
             self._estimator = estimator

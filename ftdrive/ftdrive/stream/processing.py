@@ -420,7 +420,7 @@ class Processor:
 
         NaN until the noise is known. `R_base_flange` (3, 3) is the orientation at the sample. The result grows with the
         age of the bias, if earlier runs of the sensor show how the bias changes. With `loaded` it contains the errors
-        of the sensor under the present contact; otherwise it applies to a free tool.
+        of the sensor under the current contact; otherwise it applies to a free tool.
         """
         monitor = self._monitor
         noise = self._noise.of(REST if monitor is None else monitor.state)

@@ -125,7 +125,7 @@ class Block(Paired):
     """(n,) contact, see `Sample.in_contact`."""
     sigma: Array
     """(6,) standard deviation of the newest sample of `wrench`, N and N·m, in `frame`: noise, calibration, and errors
-    of the sensor under the present contact."""
+    of the sensor under the current contact."""
     frame: WrenchFrame
     stages: Stages
 
@@ -162,7 +162,7 @@ class Sample(Displayed):
     """Whether the tool is in contact: from three consecutive readings beyond the limit until three within it.
 
     A reading is the mean over 20 ms, so a contact begins after 40 to 60 ms. One reading of a free tool in a million
-    exceeds the limit (`false_alarm_rate`). The limit follows the noise in the present state of motion, also with
+    exceeds the limit (`false_alarm_rate`). The limit follows the noise in the current state of motion, also with
     filtered sensors. A force that grows by less than 20 N within an hour is taken for drift of the bias. In motion,
     inertia that is not subtracted raises the limit, so smaller contacts are not detected."""
     frame: WrenchFrame

@@ -367,7 +367,7 @@ class FreeTool:
         self._references = [_Reference(self._calibration, 0, made_C)]
         self.held: Weight | None = None
         self.empty: Calibrated = self._calibration
-        """The newest reference at the present temperature."""
+        """The newest reference at the current temperature."""
         self.expected: Calibrated = self._calibration
         """The empty tool plus the held part."""
         self.load: Calibrated = self._calibration

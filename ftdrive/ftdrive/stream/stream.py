@@ -199,7 +199,7 @@ class Stream(Displayed):
         Raises
         ------
         ConfigError
-            The tool has no accepted calibration. The stream continues with the present one.
+            The tool has no accepted calibration. The stream continues with the current one.
         """
         before = self.processor
         info = self.devices.use_tool(name)
@@ -413,7 +413,7 @@ def pump(
 
 
 class _Outlets:
-    """The sinks of one loop, with the present delay of each, s."""
+    """The sinks of one loop, with the current delay of each, s."""
 
     def __init__(self, stream: Stream, sinks: list[Sink], say: Callable[[str], object]) -> None:
         self._stream, self._sinks, self._say = stream, sinks, say

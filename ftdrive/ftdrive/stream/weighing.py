@@ -293,7 +293,7 @@ def count_of(weight: Weight, part_kg: float) -> int:
 
 @dataclass(frozen=True, slots=True)
 class ScaleState:
-    """The present state of the scale."""
+    """The current state of the scale."""
 
     weight: Weight | None
     refusal: str | None
@@ -334,7 +334,7 @@ class Weighing(Sink):
     ) -> None:
         self.stream, self.part_kg, self.joins, self.moving = stream, part_kg, joins, moving
         self._scale, self._keep = Scale(stream), keep
-        # Weight of the present load; None if nothing was weighed since the reading was last not at rest.
+        # Weight of the current load; None if nothing was weighed since the reading was last not at rest.
         self._last: Weight | None = None
         self._due_s = stream.clock.now_s() + _STEP_S
         # Time of a zero request on the clock of the cell; set by another thread.

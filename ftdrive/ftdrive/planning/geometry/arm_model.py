@@ -91,7 +91,7 @@ def _extent(bodies: Bodies, direction: Array) -> Array:
 
 
 def separation(a: Bodies, b: Bodies, enough_m: Array) -> Array:
-    """Return a lower bound (k,) of the distance of each pair of bodies, m; at most zero if the pair may touch.
+    """Return a lower bound (k,) on the distance between each pair of bodies, m; at most zero if the pair may touch.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def separation(a: Bodies, b: Bodies, enough_m: Array) -> Array:
     """
     between, capsule_distance = _between_axes(a, b)
     bound = capsule_distance - (a.radius_m + a.rounding_m + b.radius_m + b.rounding_m)
-    # The distance of the axes is exact for capsules, but not for flat ends.
+    # The distance between the axes is exact for capsules, but not for flat ends.
     open_ = np.flatnonzero((bound < enough_m) & (a.radius_m + b.radius_m > 0))
     if len(open_):
         inner_a, inner_b = (replace(body.some(open_), rounding_m=np.zeros(len(open_))) for body in (a, b))
@@ -112,7 +112,7 @@ def separation(a: Bodies, b: Bodies, enough_m: Array) -> Array:
 
 
 def separation_from_box(bodies: Bodies, low_m: Array, high_m: Array, enough_m: Array) -> Array:
-    """Return a lower bound (k,) of the distance of each body to a box, m, which is refined up to `enough_m` (k,)."""
+    """Return a lower bound (k,) on the distance from each body to a box, m, which is refined up to `enough_m` (k,)."""
     centre, half = (low_m + high_m) / 2, (high_m - low_m) / 2
     point = bodies.centre_m
     # For a body that intersects the box the bound is -1 m, because the depth is not computed.
@@ -163,7 +163,7 @@ def _nearest(bodies: Bodies, point: Array) -> Array:
 
 
 def _between_axes(a: Bodies, b: Bodies) -> tuple[Array, Array]:
-    """Return the point (k, 3) of each axis segment b nearest to segment a, and the distance (k,) of the segments, m.
+    """Return the point (k, 3) of each axis segment b nearest to segment a, and their distance (k,), m.
 
     The distance is convex in the two positions, so the unconstrained solution, clipped to one segment and then to
     the other, is exact (Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
@@ -451,7 +451,7 @@ class ArmModel:
         return ball_m + float(self._off_m[3:].sum()) + 0.015
 
     def describe(self) -> dict[str, Any]:
-        """Return model, nominal geometry and shape, on which a plan depends, for its hash."""
+        """Return the model, nominal geometry and shape for the hash of a plan, which depends on them."""
         nominal = MODELS[self.name]
         lengths = nominal.d_m[0], *nominal.a_m[1:3], *nominal.d_m[3:]
         names = ("d1_m", "a2_m", "a3_m", "d4_m", "d5_m", "d6_m")
@@ -467,7 +467,7 @@ class ArmModel:
 
     @cached_property
     def _off_m(self) -> Array:
-        """Bound (6,) of the displacement beyond each link relative to an arm with the same lengths and exact axes."""
+        """Bound (6,) on the displacement beyond each link relative to an arm with the same lengths and exact axes."""
         shift_m, tilt_rad = deviation(self.kinematics)
         length_m = np.linalg.norm(self.kinematics.links_m, axis=1)
         after_m = length_m[::-1].cumsum()[::-1] - length_m
@@ -478,7 +478,7 @@ class ArmModel:
         return np.asarray(shift_m + tilt_rad * (after_m + beyond_m + thick_m))
 
     def _travel(self) -> Array:
-        """Return a bound (k, 6) of the displacement of a point of body i per radian of joint j, m.
+        """Return a bound (k, 6) on the displacement of a point of body i per radian of joint j, m.
 
         It is the largest distance of a point of the body from the axis of the joint over all postures, for an arm with
         exact axes, plus the deviation of the links in between. Joint 6 does not move a body that is round about its

@@ -1,8 +1,8 @@
 """Proof that straight joint moves are clear along their whole length, not only at samples.
 
-In a straight joint move, the distance of two bodies changes by at most the sum of |turn| times the longest lever over
-the joints between the bodies. An interval is clear if the distance at its midpoint exceeds half of this change. Other
-intervals are halved. Only undecided pairs are examined again.
+In a straight joint move, the distance between two bodies changes by at most the sum of |turn| times the longest lever
+over the joints between the bodies. An interval is clear if the distance at its midpoint exceeds half of this change.
+Other intervals are halved. Only undecided pairs are examined again.
 """
 
 from dataclasses import dataclass
@@ -43,9 +43,9 @@ class Certificate:
     clear: NDArray[np.bool_]
     """(m,) whether the whole move keeps the margins."""
     self_clearance_m: Array
-    """(m,) lower bound of the distance between parts of arm and tool; an upper bound if the move is not clear."""
+    """(m,) lower bound on the distance between parts of arm and tool; an upper bound if the move is not clear."""
     scene_clearance_m: Array
-    """(m,) the same bound of the distance to planes and boxes; infinite if there are none."""
+    """(m,) the same bound on the distance to planes and boxes; infinite if there are none."""
     limited_by: tuple[str, ...]
     """(m,) the pair of bodies whose distance comes closest to the margin."""
 
@@ -98,7 +98,7 @@ class Certifier:
         return Certifier(ArmModel(arm.name, arm.tool, own), self.scene, self.margins)
 
     def reach_m(self, off_rad: Array) -> float:
-        """Return a bound of how far any two bodies approach if each joint is off by up to `off_rad` (6,), m."""
+        """Return a bound on how far any two bodies approach if each joint is off by up to `off_rad` (6,), m."""
         return float((self._lever_m @ np.abs(off_rad)).max())
 
     def keeping(self, more_m: float) -> "Certifier":
@@ -181,7 +181,7 @@ class Certifier:
         return Certificate(clear, stated[:, 0], stated[:, 1], tuple(self._names[i] for i in limited_by))
 
     def _distance(self, q_rad: Array, row: NDArray[np.intp], pair: NDArray[np.intp], enough_m: Array) -> Array:
-        """Return lower bounds (k,) of the distances of pairs at joint vectors, m; coarse if a coarse bound suffices."""
+        """Return lower bounds (k,) on the distances of pairs at joint vectors, m; coarse if a coarse bound suffices."""
         bodies = self.arm.bodies(q_rad)
         distance = np.empty(len(pair))
         of_arm = pair < len(self._pairs)

@@ -136,7 +136,7 @@ def inverse(kinematics: Kinematics, R_base_flange: Array, p_base_flange_m: Array
     -------
     array, shape (n, 8, 6)
         Joint angles in (-pi, pi] for two shoulders, two wrists and two elbows, in this order of nesting; nan if there
-        is no solution. Near the stretched arm, also nan if only the real or only the nominal arm has a solution.
+        is no solution. Also nan near the stretched arm, if only the real or only the nominal arm has a solution.
     """
     R, p = np.asarray(R_base_flange, dtype=np.float64), np.asarray(p_base_flange_m, dtype=np.float64)
     (d1, a2, a3, d4, d5, d6), offset = _parallel(kinematics)

@@ -55,12 +55,12 @@ class Scene:
         return np.array([-np.sin(self.lean_rad), 0.0, -np.cos(self.lean_rad)])
 
     def describe(self) -> dict[str, Any]:
-        """Return planes, boxes and lean, on which a plan depends, for its hash."""
+        """Return the planes, boxes and lean for the hash of a plan, which depends on them."""
         return asdict(self)
 
 
 def down_of(mounting: str | None) -> Array:
-    """Return the unit vector (3,) along gravity in base for a mounting."""
+    """Return the unit vector (3,) along gravity in base axes for a mounting."""
     return Scene(lean_rad=lean_of(mounting)).down_base
 
 

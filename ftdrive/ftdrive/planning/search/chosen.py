@@ -57,7 +57,7 @@ class Chosen:
     ideal_force_rms_N: float
     """Predicted RMS error of the best poses if every pose were reachable."""
     elsewhere: bool
-    """Whether joints 1 to 3 differ from the present posture."""
+    """Whether joints 1 to 3 differ from the current posture."""
 
 
 def chosen_tour(
@@ -159,7 +159,7 @@ def hung_tour(
 ) -> tuple[tuple[int, ...], Array, Array] | None:
     """Return a short closed tour through tilts with a load on a string, spread evenly about straight down.
 
-    The hook is at the same point in all tilts, near its present position, and the tool is turned little. Returns
+    The hook is at the same point in all tilts, near its current position, and the tool is turned little. Returns
     numbers from 101, in the order of choice, joint vectors (n, 6) in the order of travel, and the hook (3,) in base, m;
     None if too few poses are reachable.
     """
@@ -188,7 +188,7 @@ class _SteadyHook(Certifier):
         self._most_m = most_m
 
     def certify(self, start_rad: ArrayLike, end_rad: ArrayLike, *, tight: bool = True) -> Certificate:
-        """As `Certifier.certify`; a move that displaces the hook is not clear."""
+        """Like `Certifier.certify`, but a move that displaces the hook is not clear."""
         start, end = (np.asarray(q, dtype=np.float64).reshape(-1, 6) for q in (start_rad, end_rad))
         hooks_m = [self.arm.hook_m(self.arm.frames(start + share * (end - start))) for share in np.linspace(0, 1, 9)]
         stays = np.linalg.norm(np.subtract(hooks_m, hooks_m[0]), axis=2).max(axis=0) <= self._most_m
@@ -245,7 +245,7 @@ def _first_tour(
     choice: Callable[[Nodes], Nodes],
     speeds: Speeds,
 ) -> tuple[tuple[int, ...], Array] | None:
-    """Return the first tour of `_tours_at` at the present posture of joints 1 to 3, or at one with more room."""
+    """Return the first tour of `_tours_at` at the current posture of joints 1 to 3, or at one with more room."""
 
     def tours(q: Array) -> Iterator[tuple[tuple[int, ...], Array]]:
         return _tours_at(certifier, q, candidates, spins, poses, choice, speeds)
@@ -305,7 +305,7 @@ def _tour_through(
 
 
 def _begins_here(certifier: Certifier, q_now: Array, q_rad: Array, part: Nodes) -> list[bool]:
-    """Return for each part of free space whether a clear straight move leads into it from the present joint angles."""
+    """Return for each part of free space whether a clear straight move leads into it from the current joint angles."""
     near = np.argsort(np.abs(q_rad - q_now).max(axis=1), kind="stable")
     ends = [near[part[near] == p][:FROM_HERE] for p in range(part.max() + 1)]
     goals = q_rad[np.concatenate(ends)]

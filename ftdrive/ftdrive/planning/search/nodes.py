@@ -23,11 +23,11 @@ from ftdrivers.ur.kinematics import MODELS, Array, Kinematics
 Nodes = NDArray[np.intp]
 
 SHOULDER_RAD = float(np.radians(110))
-# Wrist 3 winds the cable, so it stays within 200° of its present angle.
+# Wrist 3 winds the cable, so it stays within 200° of its current angle.
 WRIST_6_RAD = float(np.radians(200))
 # Half a turn plus 3 degrees, by which a real arm may differ from the table, so that both directions remain possible.
 HALF_TURN_RAD = float(np.radians(183))
-# Largest turn of each joint to either side of its present angle.
+# Largest turn of each joint to either side of its current angle.
 WINDOW_RAD = np.array([np.pi, SHOULDER_RAD, np.inf, HALF_TURN_RAD, HALF_TURN_RAD, WRIST_6_RAD])
 # Largest elbow angle from the stretched arm: the elbow cannot fold further, which the collision shapes do not show.
 ELBOW_RAD = float(np.radians(165))
@@ -41,7 +41,7 @@ def wrist_nodes(certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array) ->
     Parameters
     ----------
     q_rad : array_like, shape (6,)
-        Present joint angles; the wrist stays within its windows about them.
+        Current joint angles; the wrist stays within its windows about them.
     R_base_flange : array, shape (m, 3, 3)
 
     Returns
@@ -197,12 +197,12 @@ DIFFERENT_SHAPES = tuple(np.unique([row[1:3] for row in _TOUR_DEG], axis=0, retu
 
 # The wrist angles of an orientation are the same for every nominal arm.
 _NOMINAL = MODELS["UR5e"]
-# Bound of the difference between table and wrist angles of a real arm, which is within 1.3 degrees of the nominal one.
+# Bound on the difference between table and wrist angles of a real arm, which is within 1.3 degrees of the nominal one.
 _ROOM_RAD = float(np.radians(3))
 
 
 def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
-    """Return the joint vectors (24, 6) of the constant tour at the present posture of joints 1 to 3.
+    """Return the joint vectors (24, 6) of the constant tour at the current posture of joints 1 to 3.
 
     Joints 1 to 3 keep their angles. The flange orientation of a pose is `Rz(q1 - 45 deg) @ R_i.T` with the paper's
     matrix R_i, so at a base angle other than 45 degrees the whole set is turned about the base z axis. The wrist
@@ -211,7 +211,7 @@ def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
     Parameters
     ----------
     q_rad : array_like, shape (6,)
-        Present joint angles. Joint 4 stays as close to its angle as full turns allow.
+        Current joint angles. Joint 4 stays as close to its angle as full turns allow.
     kinematics : Kinematics, optional
         Kinematics of this arm; nominal if omitted.
 

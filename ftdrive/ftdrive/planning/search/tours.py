@@ -28,7 +28,7 @@ ROUNDS = 60
 # Up to this number of joint vectors all moves are considered; otherwise only moves to the nearest in each group.
 FEW = 120
 NEAREST_OF_EACH = 2
-# From this number of groups on, only moves to the nearest joint vectors of all groups are considered.
+# With at least this number of groups, only moves to the nearest joint vectors of all groups are considered.
 MANY_GROUPS, NEAREST_OF_ALL = 60, 40
 # Approximate number of neighbours in all layers together.
 NEIGHBOURS = 10
@@ -164,7 +164,7 @@ class _Proof:
         return np.asarray((self._clear | ~self._known)[np.ix_(of, of)])
 
     def parts(self, nodes: Nodes, start: Nodes, end: Nodes) -> Nodes:
-        """Return the connected part (m,) of each node, over those of the given moves that are clear."""
+        """Return the connected part (m,) of each node, as linked by those of the given moves that are clear."""
         clear = self.prove(nodes[start], nodes[end])
         edges = coo_array((np.ones(clear.sum()), (start[clear], end[clear])), shape=(len(nodes), len(nodes)))
         return np.asarray(connected_components(edges, directed=False)[1], dtype=np.intp)
@@ -240,6 +240,6 @@ def _choice(tour: Nodes, group: Nodes, groups: list[Nodes], cost: Array) -> Node
 
 
 def _shaken(tour: Nodes, rng: np.random.Generator) -> Nodes:
-    """Return the tour with two neighbouring segments exchanged (double bridge)."""
+    """Return the tour with two neighbouring segments swapped (double bridge)."""
     a, b, c = np.sort(rng.choice(np.arange(1, len(tour) + 1), 3, replace=False))
     return np.concatenate([tour[:a], tour[b:c], tour[a:b], tour[c:]])
