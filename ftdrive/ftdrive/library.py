@@ -65,7 +65,7 @@ def solve(
     ----------
     source : str, Path, Run, DataFrame, mapping, pair of arrays, CalibrationDataset or Recording
         A source or result of `read_dataset`, such as a pair (R_base_flange, wrench) of shapes (n, 3, 3) and (n, 6). A
-        table with closely spaced rows, a bag, a file of `ftdrive record` and a result of `read_recording` are
+        table with closely spaced rows, a ROS bag, a file of `ftdrive record` and a result of `read_recording` are
         recordings in motion.
     method : Method
         "ml": maximum likelihood, which needs at least 4 poses; or one of the published methods, for comparison.
@@ -123,13 +123,13 @@ def read_recording(
     calibration: CalibrationResult | None = None,
     table: TableOptions | None = None,
 ) -> Recording:
-    """Read a recording into memory; also the `.partial` file of an interrupted recording.
+    """Read a recording into memory, or the `.partial` file of an interrupted recording.
 
     Parameters
     ----------
     source : str, Path, DataFrame or mapping
         A file of `ftdrive record`, with the format given by its suffix: .mcap, .csv or .parquet; or of another program:
-        a bag, or a table with wrench and orientation as text, DataFrame or arrays by name.
+        a ROS bag, or a table with wrench and orientation as text, DataFrame or arrays by name.
     columns : collection of str
         Required fields of `Recording.rows`. Others may be left out, which makes reading faster.
     calibration : CalibrationResult, optional
@@ -275,8 +275,8 @@ def open_stream(
     stages : Stages
         Processing steps between raw and compensated wrench.
     on_contact : callable
-        Called by the reading thread with each `Contact` after 40 to 60 ms, and again at its end (`contact.over`).
-        `Stream.on_contact` may be set at any time.
+        Called by the reading thread with each `Contact` 40 to 60 ms after its start, and again at its end
+        (`contact.over`). `Stream.on_contact` may be set at any time.
     force : bool
         Apply a calibration of another arm, sensor or mount, with a warning in `Stream.warnings`, or one that
         was edited by hand, with a mark in `StreamInfo.marks`.

@@ -312,7 +312,7 @@ def clock_in_force() -> Clock:
 
 
 def load(config: Path | None = None, flags: Mapping[str, Flag] | None = None, *, devices: bool = True) -> CellConfig:
-    """Return the cell from all sources, see `settings`; with `devices` false, arm and sensor may lack an address."""
+    """Return the cell from all sources (see `settings`); with `devices` false, arm and sensor may lack an address."""
     return cell_of(settings(config, flags), devices=devices)
 
 
@@ -460,7 +460,7 @@ def _suggestion(unknown: str, kind: str, names: Iterable[str]) -> str:
 
 
 def read_recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the sections that a run has recorded; raises `ConfigError` for a value of a wrong type.
+    """Return the sections that a run has recorded; raises `ConfigError` for a value of the wrong type.
 
     Unknown keys are left out. Ranges are not checked, because another version may have had other ranges.
     """

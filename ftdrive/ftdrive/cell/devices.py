@@ -24,7 +24,7 @@ def build_arm(cell: CellConfig) -> RobotArm:
         build = cast("Callable[..., RobotArm]", arm_class(driver))
     except BadUrl as error:
         raise ConfigError(f"[robot] driver: {error}") from error
-    # Only an emulated arm gets a clock, because a driver of another package may not accept one.
+    # Only an emulated arm gets a clock, because a driver from another package may not accept one.
     more: dict[str, Any] = {"clock": cell.clock} if cell.is_emulated else {}
     if driver == "ur":
         timing = UrTiming.emulated() if cell.is_emulated else STRICT

@@ -58,7 +58,7 @@ def row(what: str, text: str, counts: Sequence[int]) -> list[float]:
 
 
 def rows_reader(*counts: int) -> Callable[[str, str], list[float]]:
-    """Return a function like `row` for rows of these numbers of lengths."""
+    """Return a function like `row` for rows with these numbers of lengths."""
     return lambda what, text: row(what, text, counts)
 
 

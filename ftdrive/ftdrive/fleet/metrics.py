@@ -29,7 +29,7 @@ def _labels(*texts: str | None) -> list[str]:
     return [visible(text or "") for text in texts]
 
 
-# Metrics with the labels `TOOL`: help text, and function of the value; a value of None is left out.
+# Metrics with the labels `TOOL`: help text, and function that returns the value; None is left out.
 OF_TOOL: Final[Mapping[str, tuple[str, Callable[[CellState], float | None]]]] = {
     "ftdrive_calibration_timestamp_seconds": (
         "When the newest accepted calibration was made.",

@@ -115,7 +115,7 @@ MOST: Final = 4
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Return names joined for a sentence, such as "a, b and c"; of many names only the first."""
+    """Return names joined for a sentence, such as "a, b and c"; if there are many, only the first."""
     shown = list(names) if len(names) <= MOST + 1 else [*names[:MOST], f"{len(names) - MOST} more"]
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
 

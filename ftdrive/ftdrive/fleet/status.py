@@ -69,7 +69,7 @@ def _drift_of(changes: Changes | None, start: datetime) -> BiasDrift | None:
 def _cell_state(cell: StoredCell, result: StoredResult, observed: Observed, store: Store) -> CellState:
     calibrated = when(result)
     check: VerificationRecord | None = next(reversed(observed.checks.get(result.id, ())), None)
-    if check is None and calibrated < observed.now - WINDOW:  # its verifications may be older than those read
+    if check is None and calibrated < observed.now - WINDOW:  # its verifications may be older than those already read
         check = store.last_verification(result.id)
     verified = None if check is None or check.created_utc is None else when(check)
     temperatures = (None if check is None else check.temperature_C, result.temperature_C)
@@ -105,7 +105,7 @@ MOST_SENSOR_KG: Final = 1.0
 TILTED_RAD: Final = np.deg2rad(0.1)
 # Added to the sigma of a tilt, because the arm bends differently in each posture.
 TILT_FLOOR_RAD: Final = np.deg2rad(0.02)
-# Significance level of a turned base: a false finding in one of 50 fleets of 200 cells.
+# Significance level for a turned base: a false finding in one of 50 fleets of 200 cells.
 SURE: Final = 1e-4
 # Tolerance after the due time of a verification.
 LATE: Final = timedelta(days=1)

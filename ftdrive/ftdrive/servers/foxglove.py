@@ -1,8 +1,8 @@
 """Server of the stream for Foxglove, Lichtblick and PlotJuggler: WebSocket, parameters and scene.
 
 Wrenches, poses, joint angles and frames are ROS 2 messages, because the viewers have no other wrench type and
-PlotJuggler no other encoding. Arrows and events have types of Foxglove. Programs can tare, and set frame and stages.
-Browser pages are accepted from a few origins, and may do the same if control is allowed, see `http_gate`.
+PlotJuggler no other encoding. Arrows and events have Foxglove types. Programs can tare, and can set the frame and the
+stages. Browser pages are accepted from a few origins, and may do the same if control is allowed, see `http_gate`.
 """
 
 import json
@@ -155,7 +155,7 @@ class FoxgloveServer(Sink, ServerListener):
                 message_encoding="cdr",
                 schema=Schema(name=schema.name, encoding="ros2msg", data=schema.text.encode()),
                 context=context,
-            ).base  # no type checks, 15 000 times per second
+            ).base  # without type checks: called 15 000 times per second
             for topic, schema in (ros2.SCHEMAS | {ros2.TRANSFORMS: ros2.TRANSFORMS_SCHEMA}).items()
         } | {
             ARROWS: SceneUpdateChannel(ARROWS, context=context),
@@ -274,7 +274,7 @@ class FoxgloveServer(Sink, ServerListener):
     def on_get_parameters(
         self, _client: Client, param_names: list[str], _request: str | None = None
     ) -> list[Parameter]:
-        """Return the parameters with these names, or all without names. Called in a thread of the SDK."""
+        """Return the parameters with these names, or all if no names are given. Called in a thread of the SDK."""
         values = parameters_of(self._stream.frame, self._stream.stages)
         return [Parameter(name, value=value) for name, value in values.items() if name in (param_names or values)]
 

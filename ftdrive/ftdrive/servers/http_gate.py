@@ -81,8 +81,8 @@ def _is_bound(host: str, bound: str) -> bool:
 
 
 def hidden_host() -> str:
-    """Return an address of this computer for a server behind a gate, which a page cannot guess."""
-    if sys.platform == "darwin":  # has one loopback address only
+    """Return an address of this computer that a web page cannot guess, for a server behind a gate."""
+    if sys.platform == "darwin":  # has only one loopback address
         return "127.0.0.1"
     return "127." + ".".join(str(random.SystemRandom().randint(1, 254)) for _ in range(3))
 
@@ -115,7 +115,7 @@ class Request:
 class Gate:
     """Listens for HTTP, refuses foreign requests, and calls `serve` for each permitted one.
 
-    Port 0 lets the system choose, see `port`; `origins` as in `refusal_reason`. Raises `OSError` for an address that
+    Port 0 lets the system choose, see `port`; `origins` is as in `refusal_reason`. Raises `OSError` for an address that
     cannot be used.
     """
 

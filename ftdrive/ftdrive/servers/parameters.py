@@ -34,7 +34,7 @@ _EXPECTED: Final = {
 
 
 def checked_value(name: str, value: Any) -> JSON:
-    """Return the value in the type of frame or stages. Raises `ConfigError`."""
+    """Return the value in the type that `WrenchFrame` or `Stages` requires. Raises `ConfigError`."""
     kind = _KINDS.get(name)
     named = {"axes": get_args(Axes), "about": get_args(Point)}.get(name, ())
     if value in named or (kind is bool and isinstance(value, bool)):
@@ -61,7 +61,7 @@ def with_changes(frame: WrenchFrame, stages: Stages, changes: Iterable[tuple[str
 
 
 def set_stream(stream: "Stream", frame: WrenchFrame, stages: Stages, then: Callable[[], object] = lambda: None) -> None:
-    """Set frame and stages of a stream, and call `then`; after a `ConfigError` of these the stream is unchanged."""
+    """Set frame and stages of a stream, and call `then`; if either raises `ConfigError`, the stream is unchanged."""
     before = stream.frame, stream.stages
     try:
         stream.frame, stream.stages = frame, stages

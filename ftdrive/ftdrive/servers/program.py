@@ -27,7 +27,7 @@ DOUBLES: Final = (
     *("mass", "mass_sigma", "least_mass"),
     *("com_x", "com_y", "com_z", "com_sigma_x", "com_sigma_y", "com_sigma_z"),
 )
-"""Contents of the input registers of each kind, from the first register on."""
+"""Contents of the input registers of each kind, starting at the first register."""
 TRACKED: Final = ("bias_fx", "bias_fy", "bias_fz", "bias_tx", "bias_ty", "bias_tz", "bias_age")
 """Further double registers if bias and part are tracked. If `tracking` is 0, the service does not write them."""
 

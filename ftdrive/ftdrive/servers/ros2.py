@@ -86,7 +86,7 @@ class TransformPublisher:
 class Averaged:
     """Means over the number of consecutive samples that gives at most `rate_Hz`; a single sample is not changed.
 
-    With lost samples, the mean is that of the rest. Samples of an interval cut by an interruption are dropped,
+    If samples are lost, the mean is over the others. Samples of an interval cut by an interruption are dropped,
     because their mean would be late.
     """
 

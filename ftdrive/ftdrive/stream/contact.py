@@ -1,4 +1,4 @@
-"""Contact detection: readings that differ from the prediction for a free tool, joined to contacts."""
+"""Contact detection: readings that differ from the prediction for a free tool, joined into contacts."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -24,11 +24,11 @@ from ftdrive.stream.noise import (
 )
 from ftdrive.stream.samples import Ns, Paired
 
-# The covariance of the prediction is evaluated again after the tool has turned by this angle.
+# Rotation of the tool after which the covariance of the prediction is evaluated again.
 _TURN_RAD = 0.02
-# Sigmas of the acceleration of a moving arm: without positions, if predicted from past poses, and angular.
+# Sigmas of the acceleration of a moving arm: unknown, predicted from past poses, and unknown angular acceleration.
 _UNKNOWN_M_S2, _COARSE_M_S2, _UNKNOWN_RAD_S2 = 1.0, 0.3, 2.5
-# Error of the time of a predicted wrench besides the error of the delay: accelerations are means over such a time.
+# Timing error of a predicted wrench, in addition to the delay error, because accelerations are means over some time.
 _INEXACT_S = 0.005
 # Friction torque of wrist 3, which the force/torque sensor inside the arm measures too.
 _FRICTION_NM = 0.15
@@ -141,7 +141,7 @@ class ContactTest:
         return readings, chi2, beyond
 
     def _change(self, predicted: Array, delay_sigma_s: float) -> Array:
-        """Return the change (n, 6) of the predicted wrench within one standard deviation of its time."""
+        """Return the change (n, 6) of the predicted wrench over one standard deviation of its timing error."""
         if not len(predicted):
             return predicted
         if self._predicted is None:
@@ -246,7 +246,7 @@ class Contact:
 
 
 class ContactTracker:
-    """Joins readings to contacts: three in a row beyond the limit begin a contact, three within the limit end it."""
+    """Joins readings into contacts: three in a row beyond the limit begin a contact, three within the limit end it."""
 
     def __init__(self, rate_Hz: float) -> None:
         self._lag, self._short_lag = (max(1, round(lag_s * rate_Hz)) for lag_s in (_LAG_S, _SHORT_LAG_S))

@@ -1,4 +1,4 @@
-"""Data of a stream for the live screen and the page in the browser, and the requests that both may make."""
+"""Data of a stream for the live screen and the page in the browser, and the requests that both can make."""
 
 import math
 from collections import deque
@@ -129,7 +129,7 @@ class Feed(Sink):
         elif block is None:
             self.status = self.stream.status()
         for event in events:
-            # screen and page show the tracked values separately
+            # the screen and the page show the tracked values separately
             if event.kind != "tracked":
                 text = f'mark "{event.text}"' if event.kind == "mark" else event.text
                 self._add_note(FeedNote(event.t_host_ns, text, event.kind))
@@ -162,7 +162,7 @@ class Feed(Sink):
         else:
             now_ns = self.newest_ns or 0
             utc = datetime.fromtimestamp((now_ns + self.stream.info.utc_offset_ns) * 1e-9, UTC)
-            # recordings in MCAP need poses and a calibration; the readings of a sensor alone go to a table
+            # MCAP recordings need poses and a calibration; the readings of a sensor alone go to a table
             kind, ending = ("raw", "csv") if self.stream.info.is_raw else ("live", "mcap")
             path = Path(f"{kind}-{utc:%Y-%m-%dT%H%M%SZ}.{ending}").absolute()
             self._recording, self._recording_since_ns = self._recorder(path), now_ns
@@ -277,7 +277,7 @@ class History:
         self._bin.fill(-1)
 
     def add(self, t_ns: NDArray[np.int64], wrench: Array, in_contact: NDArray[np.bool_]) -> None:
-        """Add samples in order of time: times (n,), wrenches (n, 6), and whether each is in contact (n,)."""
+        """Add samples in time order: times (n,), wrenches (n, 6), and whether each is in contact (n,)."""
         bins = t_ns // self._bin_ns
         starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
         bins = bins[starts]

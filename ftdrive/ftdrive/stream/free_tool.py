@@ -62,7 +62,7 @@ _TAILS = 4.0
 _SAME = float(chdtri(4, 1e-3))
 # Smallest and largest number of consecutive windows that determine a part; older windows are dropped.
 _RUN, _LONGEST_RUN = 4, 24
-# A new part is accepted after gravity has turned by this angle in the sensor, or the arm has moved this far: a contact
+# A new part is accepted after gravity has turned by this angle in sensor axes, or the arm has moved this far: a contact
 # stays in place. A steady force along gravity that moves with the arm looks like a part.
 _TURN_RAD, _TRAVEL_M = 0.25, 0.15
 # A window is used only after this many further windows fit the state, because the start of a contact may be too small
@@ -78,7 +78,7 @@ _DOUBTFUL_N, _DOUBTFUL_SIGMAS = 0.2, 3.0
 _USUAL_WALK_N, _WALK_KNOWN_S = 1.0, 1800.0
 # Drift allowed at a tare, one sigma, N.
 _TARED_N = 0.5
-# For the contact test, the uncertainty of the bias grows no longer than this, because a long contact is not a drift.
+# For the contact test, the bias uncertainty grows for no longer than this, because a long contact is not a drift.
 _CONTACT_S = 30.0
 # A drift is reported if it exceeds this many sigmas.
 _WARNED_SIGMAS = 5.0
@@ -191,7 +191,7 @@ class FreeToolFilter:
         return norm, float(np.sqrt(weights @ variance))
 
     def warning(self, usual_N_h: float) -> tuple[str, Mapping[str, JSON]] | None:
-        """Return text and values of a drift event once, if the drift exceeds the usual one and five sigmas."""
+        """Return the text and values of a drift event, once, if the drift exceeds the usual one and five sigmas."""
         rate, sigma = self.force_rate_N_h
         worth = max(usual_N_h, _WARNED_SIGMAS * sigma)
         before = self._is_warned
@@ -305,7 +305,7 @@ class FreeToolFilter:
             most = self._drift_N_h * max(self._known_walk_N, 1.0) * dt_s / 3600
             most = most + 3 * _force_sizes(self._trusted_sigma - seen)
             self._trusted_sigma = seen
-            # The same factor for all axes, because a contact acts on several.
+            # Use the same factor for all axes, because a contact acts on several.
             self._trusted = self._trusted + off / max(1.0, float((_force_sizes(off) / np.maximum(most, 1e-12)).max()))
             off = bias - self._trusted
             walk_N = float(self._weights @ self._walks_N)
@@ -568,7 +568,7 @@ class Following:
             self.found.append((tracked, events))
 
     def begin(self) -> None:
-        """Start tracking: a present offset is then treated as bias, no longer as contact."""
+        """Start tracking: an existing offset is then treated as bias, not as contact."""
         if not self._is_tracked:
             self._is_tracked = True
             self.filter.expect(ANY_BIAS)

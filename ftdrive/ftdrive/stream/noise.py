@@ -32,7 +32,7 @@ STATES = 1 + len(SPEEDS_RAD_S) + 1 + SLOW
 
 # Largest change between the means of two consecutive readings at rest; joint noise is 3e-5 rad.
 _STILL_RAD, _STILL_M = 2e-4, 2e-4
-# Displacement of the centre of mass, m, from which its inertial wrench is considered. Joint angles show motion later.
+# Displacement of the centre of mass, m, above which its inertial wrench is considered. Joint angles show motion later.
 _FELT_M = 4e-5
 # Rest begins, and a state of motion ends, these times after the last sample in motion, s, because the links ring.
 _HOLD_S, _RINGS_S = 0.5, 0.4
@@ -106,7 +106,7 @@ class MotionTracker:
         self._since = int(n - 1 - newest[-1])
         moving = np.arange(n) - newest < self._hold
         felt = self._felt(R_base_flange, moved[9:], change[9:])
-        # shortcut for the usual block of a live stream, in half the time
+        # shortcut for the usual block of a live stream, which halves the time
         if not (moving.any() or self._classes.any()):
             return np.full(n, REST, np.int8), felt
         speed = self._rate(moved) / self._step_s
@@ -162,8 +162,8 @@ class NoiseEstimator:
     The scatter of readings is taken about a straight line through a window. At rest, the differences between the means
     of consecutive windows are used as well. Bias, drift, a constant contact and slow errors of a calibration therefore
     have no effect. A window belongs to its fastest state of motion; readings just before motion are not used for rest,
-    because the wrench changes before the motion shows. `accelerated` (6, 3) is the wrench of the load per acceleration,
-    for the assumed vibration until the noise in motion is known.
+    because the wrench changes before the motion is visible. `accelerated` (6, 3) is the wrench of the load per
+    acceleration, for the assumed vibration until the noise in motion is known.
     """
 
     def __init__(self, rate_Hz: float, accelerated: Array) -> None:
@@ -179,12 +179,12 @@ class NoiseEstimator:
         self._first = _FIRST_M_S2**2 * accelerated @ accelerated.T
 
     def of(self, state: int) -> SensorNoise | None:
-        """Return the noise in a state, assumed until about 1 s is measured; None before the first half second."""
+        """Return the noise in a state, assumed until about 1 s has been measured; None before the first half second."""
         known, rest = self._known.get(state), self._known.get(REST)
         other = rest or next(iter(self._known.values()), None)
         if state == REST or other is None:
             return other
-        # A new class of motion takes the noise of a faster class for about 2 s.
+        # A new class of motion uses the noise of a faster class for about 2 s.
         if known is None or known.dof < _ENOUGH_DOF:
             learnt = (one for k, one in sorted(self._known.items()) if k > state and one.dof >= _ENOUGH_DOF)
             if (faster := next(learnt, None)) is not None:
@@ -315,7 +315,7 @@ class Window:
     felt_m_s2: Array
     """(3,) gravity minus acceleration of the sensor origin, sensor axes."""
     lever_s2: Array
-    """(3, 3) acceleration of a point per position vector from the sensor origin, as the sensor turns."""
+    """(3, 3) acceleration of a point per unit of its position relative to the sensor origin, as the sensor turns."""
     p_sensor_near_m: Array
     """(3,) position at which the gripper holds parts."""
     noise: Array

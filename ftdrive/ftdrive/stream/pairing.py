@@ -1,4 +1,4 @@
-"""Wrench and pose on one time axis: times of measurement, the delay between the two links, the pose at each wrench.
+"""Wrench and pose on one time axis: times of measurement, the delay between the two links, and the pose at each wrench.
 
 `Timeline` estimates when each sample was measured, except for the constant delay of its link. Only the difference of
 the delays of both links matters; `DelayEstimator` estimates it from motion.
@@ -99,7 +99,7 @@ class PoseTrack:
         self._columns[start:-1, 13] = np.maximum(2 * np.arcsin(np.minimum(chord / 2, 1.0)), 1e-9)
 
     def forget(self, t_ns: int) -> None:
-        """Discard the poses that are not needed for times from `t_ns` on."""
+        """Discard the poses that are not needed for times `t_ns` and later."""
         keep = max(int(np.searchsorted(self._t_ns, t_ns, "right")) - 1, 0)
         self._t_ns, self._columns = self._t_ns[keep:], self._columns[keep:]
 
@@ -262,7 +262,7 @@ class DelayEstimator:
 
 
 class Pairing:
-    """Aligns the samples of sensor and arm in time, and finds the pose for each wrench.
+    """Aligns the samples from the sensor and the arm in time, and finds the pose for each wrench.
 
     `sensor_rate_Hz` is the nominal rate of a sensor without a clock; NaN for a polled sensor, which has no fixed rate.
     `delay` is the delay of the wrench after the pose, s, or its estimator. Without an arm, position and joint angles
@@ -301,7 +301,7 @@ class Pairing:
         return bool(self._waiting) and self._has_arm
 
     def add_states(self, states: ArmStates) -> None:
-        """Add states of the arm."""
+        """Add states reported by the arm."""
         if not len(states.t_host_ns):
             return
         t_ns = states.t_host_ns
@@ -313,7 +313,7 @@ class Pairing:
         self._poses.forget(int(t_ns[-1]) - _KEEP_NS)
 
     def add_samples(self, samples: FtSamples) -> None:
-        """Add samples of the sensor."""
+        """Add samples from the sensor."""
         if not len(samples):
             return
         has_clock, counts = bool(np.isfinite(samples.t_device_s).all()), math.isfinite(self._rate_Hz)

@@ -93,7 +93,7 @@ class Stages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Paired(Columns):
-    """n consecutive samples of the sensor, each with the pose at its time."""
+    """n consecutive samples from the sensor, each with the pose at its time."""
 
     t_host_ns: Ns
     """(n,) time of measurement on the clock of the cell: smoothed, and corrected for the delay between the links."""

@@ -36,13 +36,13 @@ STALE_S = 0.3
 
 # Time between two attempts to reconnect, s.
 _RETRY_S = 0.2
-# The rates of sensor and arm are measured over this time after opening, s.
+# The rates of the sensor and the arm are measured over this time after opening, s.
 _RATE_S = 0.5
 _RATE_WINDOW_NS = 1_000_000_000
 _ALONE = DeviceInfo("", "", "")
 STEP_S = 0.01
 """Duration of the samples per read of a recording, s."""
-# Longest wait of a read of a recording, s, so that the reading thread reacts to keys.
+# Longest wait when reading a recording, s; it is short so that the reading thread reacts to keys.
 _WAIT_S = 0.1
 
 
@@ -103,7 +103,7 @@ class SampleSource(ABC):
 
 
 class CellSource(SampleSource):
-    """Samples of the sensor of a cell, paired with the poses of its arm; without a calibration, of the sensor alone.
+    """Samples from the sensor of a cell, paired with the poses of its arm; without a calibration, of the sensor alone.
 
     Parameters
     ----------

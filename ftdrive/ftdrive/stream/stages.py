@@ -195,7 +195,7 @@ class _Filter(Stage):
 
 
 class FrameChange(Stage):
-    """Transform the wrench to a frame; raises `ConfigError` as `FrameTransform`."""
+    """Transform the wrench to a frame; raises `ConfigError` as `FrameTransform` does."""
 
     def __init__(self, frame: WrenchFrame, info: StreamInfo) -> None:
         self.frame, self._transform = frame, FrameTransform(frame, info)
@@ -376,7 +376,7 @@ class FreeTool:
         self._bias_change = np.zeros(6)
 
     def predict(self, rows: Paired) -> tuple[Array, Array]:
-        """Return wrench of the weight (n, 6) and bias (6,)."""
+        """Return the wrench (n, 6) of the weight and the bias (6,)."""
         gravity = rows.R_base_flange.reshape(-1, 9) @ self._compensator.matrix.T
         return gravity, np.asarray(self._compensator.offset + self._bias_change)
 
@@ -465,7 +465,7 @@ class FreeTool:
 
 
 def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Mapping[str, JSON]]:
-    """Estimate the bias from the last `TARE_S` seconds; return the update, None if refused, text and values.
+    """Estimate the bias from the last `TARE_S` seconds; return the update, None if refused, and a text and values.
 
     A tare is refused if the arm moves, if the reading changes, or if the reading differs from the prediction for a free
     tool by more than noise, calibration and typical drift explain (significance 0.001). The values are the `change` of

@@ -34,7 +34,7 @@ _LATE_S: Final = 1.0
 class Stream(Displayed):
     """Stream of paired and compensated samples inside a `with` block. The arm is read, never moved.
 
-    Get samples by `read` or by iteration. No sample is skipped; a lost one leaves a gap in `Block.seq` and an event.
+    Get samples with `read` or by iteration. No sample is skipped; a lost one leaves a gap in `Block.seq` and an event.
     After `read` has raised a device error, the next `read` reconnects.
 
     Parameters
@@ -122,7 +122,7 @@ class Stream(Displayed):
 
     @property
     def devices(self) -> CellSource:
-        """The source as devices; raises `ConfigError` for a recording."""
+        """The source, which reads devices; raises `ConfigError` for a recording."""
         if not isinstance(self.source, CellSource):
             raise ConfigError("a recording has no devices: open a cell")
         return self.source
@@ -187,13 +187,13 @@ class Stream(Displayed):
                 yield from block
 
     def status(self) -> StreamStatus:
-        """Return rates, losses, ages, delay, tare and drift."""
+        """Return the status: rates, losses and ages of the devices, delay, tare and drift."""
         return self.processor.status(self.source.links())
 
     def use_tool(self, name: str) -> StreamEvent:
-        """Continue with the newest accepted calibration of another tool, after a change of tools.
+        """Continue with the newest accepted calibration of another tool, after a tool change.
 
-        The devices stay open. Noise, contact, tares and drift start from zero; the delay is kept. Call it between two
+        The devices stay open. Noise, contact, tares and drift are reset; the delay is kept. Call it between two
         reads, and open new recorders and servers, because each keeps the calibration with which it was opened.
 
         Raises
@@ -298,7 +298,7 @@ class Stream(Displayed):
         UsageError
             matplotlib is not installed.
         DeviceError
-            As `read`.
+            Raised by `read`.
         """
         begin_ns, blocks = self.clock.now_ns(), list[Block]()
         for block in pump(self, patience_s=0.0):

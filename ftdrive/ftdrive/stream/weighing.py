@@ -54,7 +54,7 @@ WORDS: Final[Mapping[str, str]] = {
     "undecided": "a contact, or a load that is not determined yet: let the arm carry it freely for about 2 s",
     "count": "not a whole number of parts: check the mass of one part, and the gripper",
 }
-"""Reason and remedy by `CannotWeigh.code`."""
+"""Reason and remedy for each `CannotWeigh.code`."""
 _FAULTS: Final = *get_args(Fault), "count"
 
 
@@ -90,8 +90,8 @@ class Scale:
     def weigh(self, since_ns: int = 0, *, more: bool = False) -> Weight:
         """Weigh over the last half second, not before `since_ns` on the clock of the cell; `more` adds earlier poses.
 
-        Earlier poses must be with the same load. Raises `CannotWeigh` if arm or reading is not at rest, or the reading
-        does not correspond to one weight.
+        Earlier poses must have been taken with the same load. Raises `CannotWeigh` if the arm or the reading is not at
+        rest, or the reading does not correspond to one weight.
         """
         stream = self._stream
         reading = self._rest(since_ns)
@@ -156,7 +156,7 @@ class Scale:
 
 
 def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, Array, Array]:
-    """Return R_base_flange (3, 3), mean (6,) and covariance (6, 6) of samples at rest. Raises `CannotWeigh`."""
+    """Return R_base_flange (3, 3), mean (6,) and its covariance (6, 6) at rest. Raises `CannotWeigh`."""
     if len(rows) < LEAST_SAMPLES or rows.t_host_ns[-1] - rows.t_host_ns[0] < 0.95e9 * WEIGH_S:
         raise CannotWeigh("samples")
     if not is_still(rows):
@@ -170,7 +170,7 @@ def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, Array, Array]:
 def weigh_in_motion(stream: Stream, since_ns: int = 0) -> Weight:
     """Weigh the load that the arm carries, tracked by the stream since `since_ns` on the clock of the cell.
 
-    Raises `CannotWeigh` during a contact, before the load is determined or without samples, and `ConfigError` if the
+    Raises `CannotWeigh` during a contact, while the load is undetermined or without samples, and `ConfigError` if the
     stream does not track the load.
     """
     if stream.track == "off":
@@ -187,7 +187,7 @@ def weigh_in_motion(stream: Stream, since_ns: int = 0) -> Weight:
 
 
 def weigh(stream: Stream, *, poses: int = 1, moving: bool = False, timeout_s: float = 10.0) -> Weight:
-    """Wait until arm and reading rest, and weigh the load in the gripper beyond its calibrated tool.
+    """Wait until the arm and the reading are at rest, then weigh the load in the gripper beyond its calibrated tool.
 
     Call `stream.tare()` with the empty gripper just before it grasps, to remove the drift of the bias.
 
@@ -334,7 +334,7 @@ class Weighing(Sink):
     ) -> None:
         self.stream, self.part_kg, self.joins, self.moving = stream, part_kg, joins, moving
         self._scale, self._keep = Scale(stream), keep
-        # Weight of the current load; None if nothing was weighed since the reading was last not at rest.
+        # Weight of the current load; None if nothing has been weighed since the reading came to rest.
         self._last: Weight | None = None
         self._due_s = stream.clock.now_s() + _STEP_S
         # Time of a zero request on the clock of the cell; set by another thread.
