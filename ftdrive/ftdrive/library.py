@@ -403,7 +403,7 @@ def plan_tour(
 
 
 def certifier_of(stream: Stream, replayed: Path | None, say: Callable[[str], object]) -> Certifier | None:
-    """Return the certifier for arm and tool of a stream's cell, or of the replayed run or recording.
+    """Return the certifier for the arm and the tool of a stream's cell, or of the replayed run or recording.
 
     None for a table of another program, and if the cell has no description of arm and tool; `say` receives the reason.
     """

@@ -300,7 +300,7 @@ RULES: Mapping[str, Rule] = {key: rule_of(item) for key, item in _KEYS.items()}
 
 
 def clock_in_force() -> Clock:
-    """Return the clock of the emulated cell that FTDRIVE_CLOCK names, else the clock of the computer.
+    """Return the clock of the emulated cell that FTDRIVE_CLOCK names, else the computer's clock.
 
     An emulated cell in another process looks like a real one, but only its own clock waits for a busy computer.
     """

@@ -27,7 +27,7 @@ _claiming = threading.Lock()
 
 
 class EmulatedClock(Clock):
-    """Clock of an emulated cell; after the end of its process it continues with the clock of the computer.
+    """Clock of an emulated cell; after the end of its process it continues with the computer's clock.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class EmulatedClock(Clock):
         weakref.finalize(self, os.close, self._descriptor)
         self._own = threading.local()
         self._seen_ns, self._seen_at_s = 0, 0.0
-        # Offset to the clock of the computer after the end of the station.
+        # Offset to the computer's clock after the station has ended.
         self._ended_ns: int | None = None
 
     def patience_s(self, limit_s: float) -> float:

@@ -283,9 +283,9 @@ def flange_load(
     The mass is ``m = m_tool + m_sensor``, its centre ``(m_tool c_tool + m_sensor c_sensor) / m`` with
     ``c_tool = p_flange_sensor + R_flange_sensor p_sensor_com``.
 
-    `sensor_kg` and `p_flange_sensor_com_m` (3,) are mass and centre of sensor and adapter; `height_m` is the height of
-    the sensor's origin above the flange face. By default the centre is at half this height on the flange axis, with a
-    uniform distribution over the height as its uncertainty.
+    `sensor_kg` and `p_flange_sensor_com_m` (3,) are the mass and centre of sensor and adapter; `height_m` is the height
+    of the sensor's origin above the flange face. By default the centre is at half this height on the flange axis, with
+    a uniform distribution over the height as its uncertainty.
     """
     # Mass and height of the sensor are configured, because gravity does not determine them.
     tool_kg, p_sensor_com_m = true_tool(result)

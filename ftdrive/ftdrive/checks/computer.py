@@ -109,7 +109,7 @@ def check_disk(folder: Path) -> Check:
 
 
 def check_workcell(cell: "CellConfig", model: str | None) -> Check:
-    """Check that tool and surroundings are described, plausible for this arm, and measured."""
+    """Check that the tool and its surroundings are described, plausible for this arm, and measured."""
     from ftdrive.planning.planner import require_possible
 
     name = "workcell.measured"

@@ -28,7 +28,7 @@ from ftdrivers.errors import (
 )
 from ftdrivers.interfaces import Array, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health, RobotArm
 
-# Makes a check from the name of a check and the error of a sensor's driver.
+# Makes a check from the name of a check and the error from a sensor's driver.
 Blame = Callable[[str, DeviceError], Check]
 
 _LOOK_S: Final = 2.0
@@ -148,7 +148,7 @@ def check_rest(wrench: Array, limits: ArrayLike | None, cell: CellConfig, *, zer
 
 
 def check_sensor_error(name: str, error: DeviceError, address: SensorAddress, permissions: Sequence[Check]) -> Check:
-    """Return the failed check for an error of a sensor's driver, with a remedy.
+    """Return the failed check for an error from a sensor's driver, with a remedy.
 
     The remedy of the error comes first. If the sensor was not reached and a permission is missing, the remedy is that
     of the permission. Without either it is the usual remedy for errors of this kind.
@@ -251,7 +251,7 @@ def _check_status(status: NDArray[np.uint32]) -> Check:
 def check_noise(wrench: Array, duration_s: float, average_s: float, guess: Guess) -> list[Check]:
     """Return checks of the noise at rest, and of the accuracy that a calibration with poses of `average_s` would have.
 
-    `guess` has the assumed mass, and the accuracy of sensor and arm; its noise is not used.
+    `guess` has the assumed mass, and the accuracies of the sensor and the arm; its noise is not used.
     """
     level = check_level(wrench)
     if level.state == "failed":

@@ -100,7 +100,7 @@ def solve_run(folder: Path, version: str = __version__) -> bytes:
 
 
 def _solve_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
-    """Solve a run from the contents of its files, on another computer; otherwise as `solve_run`."""
+    """Solve a run from the contents of its files, on another computer; otherwise like `solve_run`."""
     with TemporaryDirectory(prefix="ftdrive-solve-", dir=folder_of_worker()) as place:
         for path, content in files.items():
             file = Path(place, name, path)

@@ -34,7 +34,7 @@ def fleet_state(store: Store, now: datetime) -> Fleet:
 
 
 def fleet_of(observed: Observed, store: Store) -> Fleet:
-    """Return states and findings of the contents of a store, which is queried again for older verifications."""
+    """Return the states and findings from the contents of a store, which is queried again for older verifications."""
     states = list[CellState]()
     for cell in observed.cells:
         found = [_cell_state(cell, result, observed, store) for result in observed.newest(cell)]
@@ -100,7 +100,7 @@ SIGMAS: Final = 4.0
 ALIKE_M, WRONG_M = 0.003, 0.005
 # The corresponding limits of the masses; a mass is wrong beyond the larger of `WRONG_SHARE` and `WRONG_KG`.
 ALIKE_SHARE, WRONG_SHARE, WRONG_KG = 0.03, 0.1, 0.1
-# Largest mass of sensor and adapter, which the payload includes but the identified mass does not.
+# Largest mass of the sensor and its adapter, which the payload includes but the identified mass does not.
 MOST_SENSOR_KG: Final = 1.0
 TILTED_RAD: Final = np.deg2rad(0.1)
 # Added to the sigma of a tilt, because the arm bends differently in each posture.

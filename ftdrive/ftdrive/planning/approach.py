@@ -155,7 +155,7 @@ def _nodes(certifier: Certifier, now: Array, first: Array) -> Array:
     high = np.minimum(np.maximum(now, first) + ROOM_RAD, limit)
     spread = np.random.default_rng(0).uniform(low, high, (3 * NODES, 6))
     via = np.unique(np.vstack([np.where(corner, now, first), spread]), axis=0)
-    # If start and goal have equal joint angles, corners coincide with each other, with start or with goal.
+    # If the start and the goal have equal joint angles, corners coincide with each other, with start or with goal.
     via = via[(via != now).any(axis=1) & (via != first).any(axis=1)]
     away = np.maximum(np.abs(via - now), np.abs(via - first)).max(axis=1)
     via = via[np.argsort(away, kind="stable")]

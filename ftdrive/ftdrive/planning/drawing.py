@@ -33,7 +33,7 @@ _TURN = np.linspace(0, 2 * np.pi, 100)
 
 
 def draw_plan(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) -> None:
-    """Write a PNG of arm, tool and surroundings at every pose, seen from the front, the side and above.
+    """Write a PNG of the arm, the tool and the surroundings at every pose, seen from the front, the side and above.
 
     Needs the extra `viz`.
 

@@ -58,7 +58,7 @@ class Plan(Displayed):
     why: tuple[str, ...]
     """Sentences about the reason for this plan and its loss of accuracy."""
     made_for: Mapping[str, str]
-    """SHA-256 of model, kinematics, tool and scene with margins. Files of version 1 lack the kinematics."""
+    """SHA-256 of the model, kinematics, tool and scene with margins. Files of version 1 lack the kinematics."""
     steps: tuple[PlanStep, ...]
     acceleration_rad_s2: float
     ball_m: float
@@ -174,7 +174,7 @@ class Plan(Displayed):
         return "\n".join([*self.why, *rest, *([*rows, ""] if table else []), *_summary(self)])
 
     def stop_in_words(self, robot: RobotConfig) -> str:
-        """Describe the time and angle of a stop at the highest speed of the plan; empty for other drivers than "ur"."""
+        """Describe the time and angle of a stop at the highest speed of the plan; empty for drivers other than "ur"."""
         if robot.driver != "ur":
             return ""
         speed_deg_s, stop_deg_s2 = np.degrees(self.top_speed_rad_s), robot.stop_deceleration_deg_s2

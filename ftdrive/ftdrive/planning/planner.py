@@ -259,7 +259,7 @@ def _plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Spe
 def plan_verification(
     certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, *, speeds: Speeds, guess: Guess
 ) -> Plan:
-    """Plan a tour far from the orientations `R_fitted` (k, 3, 3) of a calibration; otherwise as `plan_tour`."""
+    """Plan a tour far from the orientations `R_fitted` (k, 3, 3) of a calibration; otherwise like `plan_tour`."""
     q_now = checked_joints(q_rad)
     if poses < FEWEST_TO_VERIFY:
         raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST_TO_VERIFY} or more")
@@ -406,7 +406,7 @@ def certifier_for(
     *,
     must_be_possible: bool = True,
 ) -> Certifier:
-    """Return the certifier for arm, tool and surroundings of a cell.
+    """Return the certifier for the arm, tool and surroundings of a cell.
 
     Parameters
     ----------

@@ -223,7 +223,7 @@ class FoxgloveServer(Sink, ServerListener):
         frame = block.frame.id
         self._send(ros2.RAW, t_ns, lambda: ros2.pack_wrenches(t_ns, block.raw, "sensor").tolist())
         self._send(ros2.COMPENSATED, t_ns, lambda: ros2.pack_wrenches(t_ns, block.wrench, frame).tolist())
-        # poses at the rate of the arm, because those between are interpolated
+        # poses at the arm's rate, because those between are interpolated
         if (rows := self._arm.rows(t_ns)).any():
             poses, t_arm_ns = block.rows(rows), t_ns[rows]
             p_m, R = poses.p_base_flange_m, poses.R_base_flange
@@ -274,14 +274,14 @@ class FoxgloveServer(Sink, ServerListener):
     def on_get_parameters(
         self, _client: Client, param_names: list[str], _request: str | None = None
     ) -> list[Parameter]:
-        """Return the parameters with these names, or all if no names are given. Called in a thread of the SDK."""
+        """Return the parameters with these names, or all if no names are given. Called in an SDK thread."""
         values = parameters_of(self._stream.frame, self._stream.stages)
         return [Parameter(name, value=value) for name, value in values.items() if name in (param_names or values)]
 
     def on_set_parameters(
         self, client: Client, parameters: list[Parameter], _request: str | None = None
     ) -> list[Parameter]:
-        """Set all parameters, or none with a warning; return the resulting values. Called in a thread of the SDK."""
+        """Set all parameters, or none with a warning; return the resulting values. Called in an SDK thread."""
         stream, changes = self._stream, [(one.name, one.get_value()) for one in parameters]
         try:
             set_stream(stream, *with_changes(stream.frame, stream.stages, changes))

@@ -53,7 +53,7 @@ def parameters_of(frame: WrenchFrame, stages: Stages) -> dict[str, JSON]:
 
 
 def with_changes(frame: WrenchFrame, stages: Stages, changes: Iterable[tuple[str, Any]]) -> tuple[WrenchFrame, Stages]:
-    """Return frame and stages with changed parameters. Raises `ConfigError`."""
+    """Return the frame and the stages with changed parameters. Raises `ConfigError`."""
     of_frame, of_stages = asdict(frame), asdict(stages)
     for name, value in changes:
         (of_frame if name in of_frame else of_stages)[name] = checked_value(name, value)
@@ -123,7 +123,7 @@ class NodeParameters:
 
     def __init__(self, node: Any, frame: WrenchFrame, tool: str) -> None:
         self.apply: Callable[[WrenchFrame, Stages, str], None] = lambda *_: None
-        """Applies frame, stages and tool, or raises `ConfigError`."""
+        """Applies the frame, stages and tool, or raises `ConfigError`."""
         defaults = parameters_of(frame, Stages()) | {"tool": tool} | asdict(Fixed())
         messages = ros2_module("rcl_interfaces.msg")
         given = {}
@@ -141,7 +141,7 @@ class NodeParameters:
         node.add_on_set_parameters_callback(self._set)
 
     def _set(self, changes: Sequence[Any]) -> Any:
-        """Apply all changes or none. Called in the thread of the node."""
+        """Apply all changes or none. Called in the node's thread."""
         result = ros2_module("rcl_interfaces.msg").SetParametersResult
         # other parameters, such as use_sim_time, belong to rclpy
         given = {one.name: _as_builtin(one.value) for one in changes if one.name in _TEXTS.keys() - _FIXED.keys()}

@@ -33,7 +33,7 @@ _TF_HZ: Final = 50.0
 
 
 class TransformPublisher:
-    """Publishes sensor and tcp in the flange once, and with each block the moving frames.
+    """Publishes the frames `sensor` and `tcp` in the flange once, and the moving frames with each block.
 
     A frame with base axes about another point moves in the flange and is published too; base to flange only on request.
     """
@@ -61,7 +61,7 @@ class TransformPublisher:
         return "_at_".join(self._names.get(part, part) for part in frame_id.split("_at_"))
 
     def use(self, info: StreamInfo) -> None:
-        """Publish the transforms of sensor and tcp, unless the height of the sensor is unknown."""
+        """Publish the transforms of the sensor and the TCP, unless the height of the sensor is unknown."""
         if np.isfinite(info.p_flange_sensor_m).all():
             _, *fixed = transforms_of(WrenchFrame(), info, np.eye(3), np.zeros(3))
             self._send(self._static, fixed, self._node.get_clock().now().nanoseconds)
@@ -408,7 +408,7 @@ class Ros2Node(Sink):
         return response
 
     def _apply(self, frame: WrenchFrame, stages: Stages, tool: str) -> None:
-        """Apply parameters in the thread of the node. Raises `ConfigError` and then changes none."""
+        """Apply parameters in the node's thread. Raises `ConfigError` and then changes none."""
         if self._stream is not None:
             set_stream(self._stream, frame, stages, partial(self._request_tool, tool))
 

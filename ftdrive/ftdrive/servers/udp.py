@@ -12,11 +12,11 @@ from ftdrive.stream.stream import Sink
 
 RATE_HZ = 200.0
 """Sending rate, Hz: a plot of 5 s is about 1000 pixels wide, so a higher rate is not visible. PlotJuggler parses
-datagrams in the thread of its window, and the system drops datagrams that are not read in time."""
+datagrams in its GUI thread, and the system drops datagrams that are not read in time."""
 
 
 class UdpSender(Sink):
-    """Sends raw and compensated wrench at `RATE_HZ`, one sample per datagram, with UTC seconds as `timestamp`.
+    """Sends the raw and the compensated wrench at `RATE_HZ`, one sample per datagram, with UTC seconds as `timestamp`.
 
     Parameters
     ----------

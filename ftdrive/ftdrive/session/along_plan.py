@@ -199,7 +199,7 @@ class AlongPlan:
         """Ask the safety questions, then guard the cell during the block; yield the guarded cell and the pose book.
 
         `driven` has the speeds and the sampling of this session. `quiet_std` (6,) is the standard deviation of the
-        samples of the resting sensor, and `predict` is as in `Judge`. The `onlookers` are called after the guards.
+        samples from the resting sensor, and `predict` is as in `Judge`. The `onlookers` are called after the guards.
         """
         cell, options, before, way = self.cell, self.options, self.before, self.before.approach.way_rad
         load = _range_guard(before)

@@ -100,7 +100,7 @@ class Progress:
         return [index + 1 for index in range(self.poses) if index not in self.driven]
 
     def index(self, stop: int) -> int:
-        """Return the index of the pose of a stop."""
+        """Return the index of the pose at a stop."""
         return (stop - 1) % self.poses
 
     def lose_place(self) -> None:

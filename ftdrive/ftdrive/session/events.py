@@ -211,7 +211,7 @@ class Estimated(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Compared(Event):
-    """Comparison of a pose of a verification with the prediction of the calibration."""
+    """Comparison of a verification pose with the prediction of the calibration."""
 
     stop: int
     number: int
@@ -224,7 +224,7 @@ class Compared(Event):
     light: str
     """Whether the poses suffice: "green" or "amber"."""
     hint: str = ""
-    """What to do if the pose is too near to a pose of the calibration; otherwise empty."""
+    """What to do if the pose is too close to a calibration pose; otherwise empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -232,9 +232,9 @@ class Weighed(Event):
     """The identified mass, once the running fit is reliable, and the payload set in the controller."""
 
     mass_kg: float
-    """Mass that the sensor carries, without sensor and adapter."""
+    """Mass that the sensor carries, without the sensor and its adapter."""
     payload_kg: float
-    """Payload set in the controller, including sensor and adapter."""
+    """Payload set in the controller, including the sensor and its adapter."""
     p_flange_payload_m: tuple[float, ...] | None
     """(3,) centre of mass of the payload, flange axes; None if the controller does not report it."""
 

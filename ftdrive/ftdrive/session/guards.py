@@ -136,7 +136,7 @@ class Seen:
     """One observation of the arm and the sensor."""
 
     t_s: float
-    """Time of the observation on the clock of the cell."""
+    """Time of the observation on the cell's clock."""
     dt_s: float
     """Time since the previous observation, at most `Limits.counted_s`."""
     motion: ExpectedMotion
@@ -293,16 +293,16 @@ class ModelGuard(Guard):
 
 @dataclass
 class SettingsGuard(Guard):
-    """Rows 7 and 8: payload and TCP do not change."""
+    """Rows 7 and 8: the payload and the TCP do not change."""
 
     _before: ArmStatus | None = field(default=None, init=False)
 
     def begin(self, seen: Seen) -> None:
-        """Store payload and TCP."""
+        """Store the payload and the TCP."""
         self._before = seen.status
 
     def look(self, seen: Seen) -> None:
-        """Compare payload and TCP with the stored values."""
+        """Compare the payload and the TCP with the stored values."""
         before, now = self._before, seen.status
         if before is None:
             return
@@ -438,7 +438,7 @@ class ContactGuard(Guard):
     """Largest distance of the tool from the flange."""
     acceleration_rad_s2: float
     quiet_std: Array
-    """Standard deviation (6,) of the samples of the resting sensor."""
+    """Standard deviation (6,) of the samples from the resting sensor."""
     predict: Callable[[Array], Array | None] = lambda _: None
     """Returns the wrench (6,) of the free tool at an orientation (3, 3); None while it is unknown."""
     _start: Array | None = field(default=None, init=False)
@@ -502,7 +502,7 @@ class ContactGuard(Guard):
 
 
 def arm_lost(error: DeviceError, *, moving: bool) -> Tripped:
-    """Return the trip of row 16: the arm reports no state. A moving arm may not receive the stop either."""
+    """Return the trip for row 16: the arm reports no state. A moving arm may not receive the stop either."""
     if not moving:
         return Tripped(Hazard.CONTROLLER_LOST, error)
     found = (
@@ -513,7 +513,7 @@ def arm_lost(error: DeviceError, *, moving: bool) -> Tripped:
 
 
 def by_safety(status: ArmStatus, words: str) -> Tripped:
-    """Return the trip of row 7, 10, 11 or 12: the safety system has stopped the arm; `words` describe the stop."""
+    """Return the trip for row 7, 10, 11 or 12: the safety system has stopped the arm; `words` describe the stop."""
     mode = status.safety_mode
     if mode == "protective stop":
         payload = "" if status.payload_kg is None else f" (payload set: {status.payload_kg:.2f} kg)"

@@ -29,7 +29,7 @@ STILL_RAD_S: Final = 0.002
 # A rotation of the flange below this is a nudge, not a move.
 LEFT_RAD: Final = radians(1)
 REPEAT_RAD: Final = radians(10)
-# Largest angle between the first pose of a program and its return there.
+# Largest angle between the first pose of a program and the pose after its return there.
 RETURN_RAD: Final = radians(0.1)
 LOOK_S: Final = 0.1
 # Time-out for an arm or sensor that is lost, s; a driver that reconnects gives up after 10 s.
@@ -165,8 +165,8 @@ class HandGuided:
     def run(self, earlier: Sequence[PoseRecord], goal: str) -> None:
         """Take poses until they suffice; `goal` describes when, and `earlier` are the poses of a resumed run.
 
-        Raises `TooFewSamples` if the sensor is too slow for the averaging time, and the errors of arm and sensor; the
-        poses saved before remain.
+        Raises `TooFewSamples` if the sensor is too slow for the averaging time, and the errors of the arm and the
+        sensor; the poses saved before remain.
         """
         self._passes_first = bool(earlier)
         # An emulated clock waits for this thread, so that it sees each standstill.

@@ -102,7 +102,7 @@ class RunningFit:
         )
 
     def remove(self, stop: int) -> None:
-        """Remove the pose of a stop before it is taken again; ignore a stop without a pose."""
+        """Remove the pose at a stop before it is taken again; ignore a stop without a pose."""
         if self._records.pop(stop, None) is None:
             return
         if self._records:

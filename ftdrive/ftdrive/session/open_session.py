@@ -54,7 +54,7 @@ class SessionOptions:
     sets: str | None = None
     """Sets of orientations of Yu's Fig. 6, such as A+E; they replace `poses`."""
     method: Method = "ml"
-    """Method that solves the poses of a calibration."""
+    """Method that solves a calibration from its poses."""
     mode: Mode = "auto"
     """Mode of the session; with `resume`, "auto" means the mode of the resumed run."""
     dry_run: bool = False
@@ -224,7 +224,7 @@ class Journal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenCell:
-    """The open arm and sensor, the clock of the cell, the journal, and the limits of the guards."""
+    """The open arm and sensor, the cell's clock, the journal, and the limits of the guards."""
 
     arm: RobotArm
     sensor: ForceTorqueSensor
@@ -237,7 +237,7 @@ class OpenCell:
         self.journal.show(Noted(words=words, warning=warning))
 
     def listen(self, duration_s: float) -> FtSamples:
-        """Collect samples of the resting sensor; reopen a failed sensor once, as after a killed session."""
+        """Collect samples from the resting sensor; reopen a failed sensor once, as after a killed session."""
         try:
             return self.sensor.collect(duration_s)
         except DeviceError as error:
@@ -258,7 +258,7 @@ class Judge(Protocol):
         """Add a pose, which replaces one with the same `stop`; return the new estimate or comparison."""
 
     def remove(self, stop: int) -> None:
-        """Remove the pose of a stop before it is taken again; ignore a stop without a pose."""
+        """Remove the pose at a stop before it is taken again; ignore a stop without a pose."""
 
     def predict(self, R_base_flange: Array) -> Array | None:
         """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain."""

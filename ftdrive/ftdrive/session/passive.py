@@ -1,4 +1,4 @@
-"""Passive calibration: another program or the operator moves the arm, and ftdrive only reads arm and sensor."""
+"""Passive calibration: another program or the operator moves the arm, and ftdrive only reads the arm and the sensor."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor

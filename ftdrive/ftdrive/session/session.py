@@ -37,7 +37,7 @@ from ftdrive.session.tour import take_tour
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from ftdrivers.registry import Options, split_url
 
-# Options in the address of a sensor that select its factory calibration, with their defaults.
+# Options in a sensor's address that select its factory calibration, with their defaults.
 _CHOOSES_CALIBRATION: Final = {"slot": 0, "calibration": 1}
 # Reported properties of a sensor that depend on its scale or factory calibration.
 _OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range", "software_bias")
@@ -130,7 +130,7 @@ class Calibrating:
         return RunningFit(g_m_s2=self.cell.site.g_m_s2, down_base=down_base, advise=by_hand, load=self.load)
 
     def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
-        """Describe the predicted sigmas of the result; empty for a new tool or with a load."""
+        """Describe the predicted sigmas of the result; empty for a new tool, or with a load."""
         if plan.kind == "tool" or self.load is not None:
             return ""
         force_N, torque_Nm = rms_sigma(sigma)

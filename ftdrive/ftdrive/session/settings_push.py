@@ -1,4 +1,4 @@
-"""Push payload and gravity from a calibration to the controller: sent after a typed word, then read back.
+"""Push the payload and gravity from a calibration to the controller: sent after a typed word, then read back.
 
 A push changes the robot's model of its load. It is refused unless the arm is that of the calibration, stands still, and
 no program runs. Every attempt that may have sent something writes a receipt with the old values, which can be restored.

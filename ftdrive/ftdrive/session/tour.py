@@ -102,7 +102,7 @@ class Tour:
 
     @property
     def undriven(self) -> list[int]:
-        """Poses from which the planned move was not driven, as `Progress.undriven`."""
+        """Poses from which the planned move was not driven; see `Progress.undriven`."""
         return self._now.undriven
 
     def _next(self) -> None:

@@ -48,7 +48,7 @@ class Verifying:
     cell: CellConfig
     calibration: CalibrationResult
     path: Path
-    """The file of the calibration."""
+    """The calibration file."""
     poses: int
     """Number of new poses to take."""
     runs: Path
@@ -97,7 +97,7 @@ class Verifying:
 
     @property
     def goal(self) -> str:
-        """Condition under which hand-guided poses suffice, as `Task.goal`."""
+        """Condition under which hand-guided poses suffice; see `Task.goal`."""
         return f"{self.poses} poses differ by {np.degrees(FRESH_RAD):.0f}° or more from those of the calibration"
 
     @cached_property
@@ -108,7 +108,7 @@ class Verifying:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warning if the poses of the calibration are unknown."""
+        """Warning if the calibration poses are unknown."""
         if len(self.R_fitted):
             return ()
         lost = f"the poses of the calibration are unknown, because its dataset.json is not next to {self.path}"
@@ -187,7 +187,7 @@ class RunningComparison:
         return compared
 
     def remove(self, stop: int) -> None:
-        """Remove the pose of a stop before it is taken again."""
+        """Remove the pose at a stop before it is taken again."""
         self._compared.pop(stop, None)
         self._fresh.discard(stop)
 

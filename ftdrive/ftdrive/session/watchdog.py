@@ -1,4 +1,4 @@
-"""The thread that runs the guards, 100 times per second on the clock of the cell; after a trip it stops the arm.
+"""The thread that runs the guards, 100 times per second on the cell's clock; after a trip it stops the arm.
 
 A stop that the controller does not answer takes 1 to 2 s; the trip is then reported before the stop has ended.
 """
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class Watcher:
-    """Runs the guards during each `watching` block; at other times it looks for stops of the safety system (row 11).
+    """Runs the guards during each `watching` block; at other times it checks for stops of the safety system (row 11).
 
     `on_trip` is called from the thread when the arm has stopped, or after 0.2 s if the stop takes longer.
     """

@@ -204,7 +204,7 @@ class Contact:
     """
 
     begin_ns: int
-    """Time of the first reading beyond the limit, on the clock of the cell."""
+    """Time of the first reading beyond the limit, on the cell's clock."""
     last_ns: int
     """Time of the newest reading beyond the limit."""
     peak_N: float

@@ -268,7 +268,7 @@ class Processor:
         *,
         temperature: BiasTemperature | None = None,
     ) -> None:
-        # other threads may set frame and stages, and tare
+        # other threads may set the frame and the stages, and tare
         self._lock = RLock()
         self.info, self._frame, self._settings = info, frame, settings or standard_stages(info)
         self.stages: tuple[Stage, ...] = stages_of(self._settings, frame, info)

@@ -1,4 +1,4 @@
-"""Data types of a compensated stream: blocks of samples, their frame and stages, events and status.
+"""Data types of a compensated stream: blocks of samples with their frame and stages, events, and status.
 
 `FrameTransform` transforms a wrench to the axes and reference point of a frame.
 """
@@ -96,7 +96,7 @@ class Paired(Columns):
     """n consecutive samples from the sensor, each with the pose at its time."""
 
     t_host_ns: Ns
-    """(n,) time of measurement on the clock of the cell: smoothed, and corrected for the delay between the links."""
+    """(n,) time of measurement on the cell's clock: smoothed, and corrected for the delay between the links."""
     t_device_s: Array
     """(n,) time on the sensor's own clock; NaN if it has none."""
     seq: Ns
@@ -151,7 +151,7 @@ class Sample(Displayed):
     """One compensated sample."""
 
     t_s: float
-    """Time of the measurement, on the clock of the cell."""
+    """Time of the measurement, on the cell's clock."""
     force_N: Array
     torque_Nm: Array
     force_sigma_N: Array
@@ -266,7 +266,7 @@ class Tracked(Displayed):
         }
 
     def in_words(self) -> str:
-        """Return bias and part with their sigma as one line."""
+        """Return the bias and the part with their sigmas as one line."""
         force_N = float(np.linalg.norm(self.bias[:3]))
         sigma_N = float(np.linalg.norm(self.sigma[:3]) / np.sqrt(3))
         seen = f", seen {self.last_seen_s:.0f} s ago" if self.last_seen_s >= 1 else ""
@@ -287,7 +287,7 @@ class StreamInfo(Displayed):
     sensor: DeviceInfo
     tool: str
     utc_offset_ns: int
-    """UTC minus the clock of the cell: `t_host_ns + utc_offset_ns` is nanoseconds since 1970."""
+    """UTC minus the cell's clock: `t_host_ns + utc_offset_ns` is nanoseconds since 1970."""
     sensor_rate_Hz: float
     arm_rate_Hz: float
     p_flange_sensor_m: Array
@@ -302,7 +302,7 @@ class StreamInfo(Displayed):
     calibration_state: str = ""
     """Id, verdict, marks, age and last verification of the calibration when the stream was opened, as text."""
     emulated: bool = False
-    """Whether arm and sensor are emulated."""
+    """Whether the arm and the sensor are emulated."""
     foreign: bool = False
     """Whether the calibration belongs to another arm, sensor or mount and was applied with --force."""
     hour_change: Array | None = None

@@ -245,7 +245,7 @@ def stages_of(settings: Stages, frame: WrenchFrame, info: StreamInfo) -> tuple[S
 
 
 def standard_stages(info: StreamInfo) -> Stages:
-    """Return bias and gravity, plus inertia if calibration and cell allow it; for a sensor alone, no stages."""
+    """Return bias and gravity, plus inertia if the calibration and the cell allow it; for a sensor alone, no stages."""
     if info.is_raw:
         return Stages(bias=False, gravity=False)
     return Stages(inertia=info.calibration.motion is not None and bool(np.isfinite(info.p_flange_sensor_m).all()))
@@ -358,7 +358,7 @@ class FreeTool:
         self._now_C = self._noted_C = made_C
         self._hour_change = info.hour_change
         created = self._calibration.provenance.get("created_utc")
-        # Time of the calibration on the clock of the cell; None if unknown.
+        # Time of the calibration on the cell's clock; None if unknown.
         self._made_ns = (
             round(datetime.fromisoformat(created).timestamp() * 1e9) - info.utc_offset_ns
             if isinstance(created, str)
@@ -440,7 +440,7 @@ class FreeTool:
         return self._temperature is not None and not abs(temperature_C - self._now_C) < _STEP_K
 
     def warming(self) -> tuple[str, Mapping[str, JSON]] | None:
-        """Return text and values of a temperature event, if the change since the last one is large enough."""
+        """Return the text and values of a temperature event, if the change since the last one is large enough."""
         if self._temperature is None or abs(self._now_C - self._noted_C) < _NOTED_K:
             return None
         self._noted_C = self._now_C
@@ -465,7 +465,7 @@ class FreeTool:
 
 
 def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Mapping[str, JSON]]:
-    """Estimate the bias from the last `TARE_S` seconds; return the update, None if refused, and a text and values.
+    """Estimate the bias from the last `TARE_S` seconds; return the update, None if refused, the text and the values.
 
     A tare is refused if the arm moves, if the reading changes, or if the reading differs from the prediction for a free
     tool by more than noise, calibration and typical drift explain (significance 0.001). The values are the `change` of

@@ -176,7 +176,7 @@ class Stream(Displayed):
                 return block
 
     def _call_on_contact(self, processor: Processor) -> None:
-        # Called without the lock of the processor, because the function may call the stream.
+        # Called without the processor's lock, because the function may call the stream.
         for contact in processor.take_contacts():
             if self.on_contact is not None:
                 self.on_contact(contact)

@@ -88,7 +88,7 @@ class Scale:
         self._quietest = np.full(6, np.inf)
 
     def weigh(self, since_ns: int = 0, *, more: bool = False) -> Weight:
-        """Weigh over the last half second, not before `since_ns` on the clock of the cell; `more` adds earlier poses.
+        """Weigh over the last half second, not before `since_ns` on the cell's clock; `more` adds earlier poses.
 
         Earlier poses must have been taken with the same load. Raises `CannotWeigh` if the arm or the reading is not at
         rest, or the reading does not correspond to one weight.
@@ -156,7 +156,7 @@ class Scale:
 
 
 def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, Array, Array]:
-    """Return R_base_flange (3, 3), mean (6,) and its covariance (6, 6) at rest. Raises `CannotWeigh`."""
+    """Return R_base_flange (3, 3), the mean (6,) at rest, and its covariance (6, 6). Raises `CannotWeigh`."""
     if len(rows) < LEAST_SAMPLES or rows.t_host_ns[-1] - rows.t_host_ns[0] < 0.95e9 * WEIGH_S:
         raise CannotWeigh("samples")
     if not is_still(rows):
@@ -168,7 +168,7 @@ def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, Array, Array]:
 
 
 def weigh_in_motion(stream: Stream, since_ns: int = 0) -> Weight:
-    """Weigh the load that the arm carries, tracked by the stream since `since_ns` on the clock of the cell.
+    """Weigh the load that the arm carries, tracked by the stream since `since_ns` on the cell's clock.
 
     Raises `CannotWeigh` during a contact, while the load is undetermined or without samples, and `ConfigError` if the
     stream does not track the load.
@@ -337,7 +337,7 @@ class Weighing(Sink):
         # Weight of the current load; None if nothing has been weighed since the reading came to rest.
         self._last: Weight | None = None
         self._due_s = stream.clock.now_s() + _STEP_S
-        # Time of a zero request on the clock of the cell; set by another thread.
+        # Time of a zero request on the cell's clock; set by another thread.
         self._zero_ns: int | None = None
         self._fault: str | None = None
         self._fault_since_s = 0.0

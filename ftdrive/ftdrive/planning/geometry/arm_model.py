@@ -1,4 +1,4 @@
-"""Shapes of arm and tool, their positions at given joint angles, and distances between them.
+"""Shapes of the arm and the tool, their positions at given joint angles, and distances between them.
 
 A body is a cylinder with flat ends, enlarged by a rounding radius; a cylinder of radius 0 then becomes a capsule. Along
 a direction u, the distance between bodies A and B is at least `min_B(u·x) - max_A(u·x)`. Alternating projections

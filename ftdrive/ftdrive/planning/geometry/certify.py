@@ -31,7 +31,7 @@ class Margins:
     """Smallest allowed distances, m."""
 
     self_m: float = 0.020
-    """Between parts of arm and tool; larger than the errors of their shapes and of nominal kinematics."""
+    """Between parts of the arm and the tool; larger than the errors of their shapes and of nominal kinematics."""
     scene_m: float = 0.030
     """Between the arm or its tool and the surroundings."""
 
@@ -138,7 +138,7 @@ class Certifier:
         m, n_pairs, n_self = len(start), len(self._margin_m), len(self._pairs)
         approach_m = np.abs(turn) @ self._lever_m.T  # (m, p) largest approach over the whole move
         leading = np.abs(turn).max(axis=1)
-        proven = np.full((m, 2), np.inf)  # smallest lower bound of the settled intervals, by kind
+        proven = np.full((m, 2), np.inf)  # smallest lower bound over the settled intervals, by kind
         nearest = np.full((m, 2), np.inf)  # smallest distance so far, by kind
         least_excess, limited_by = np.full(m, np.inf), np.zeros(m, dtype=np.intp)
         clear = np.ones(m, dtype=np.bool_)
