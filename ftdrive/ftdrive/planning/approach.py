@@ -121,7 +121,7 @@ def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Spe
     np.fill_diagonal(possible, val=False)
     proven = np.zeros_like(possible)
     for _ in range(ROUNDS):
-        # The shortest-path trees of start and goal give the best path through every node. Batches are certified.
+        # The shortest-path trees of start and goal give the best path through each node. Path batches are certified.
         distance, before = dijkstra(
             np.where(possible, cost, 0.0), directed=False, indices=[0, 1], return_predecessors=True
         )

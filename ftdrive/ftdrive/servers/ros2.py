@@ -200,7 +200,7 @@ def _link_state(part: str, link: LinkStatus, device: Any, lost: int) -> PartStat
 NAME: Final = "ftdrive"
 REPORT_S: Final = 0.4
 """Time between two reports, s; a fault is reported at once."""
-# Samples are processed in blocks of this duration, s, which is the delay of a message at most.
+# Samples are processed in blocks of this duration, s, which is the maximum delay of a message.
 _BLOCK_S: Final = 0.008
 _CONTACT_S: Final = 0.1
 # Time until the other nodes of this computer and network are discovered, s.

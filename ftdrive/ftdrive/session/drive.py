@@ -181,7 +181,7 @@ class GuardedCell:
             raise stop
 
     def reopen(self) -> None:
-        """Reopen arm and sensor; raise if the cause persists. Only the operator clears a stop of the safety system."""
+        """Reopen the arm and the sensor; raise if the cause persists. Only the operator clears a safety-system stop."""
         self.watcher.look_aside()
         unseen = self.watcher.unseen
         try:

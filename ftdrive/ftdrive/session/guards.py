@@ -57,7 +57,7 @@ class Limits:
     nominal_rad: float = float(np.radians(3.0))
     """Largest allowed deviation from nominal kinematics. Real arms deviate by up to 7.5 mm and 1.3 degrees."""
     lag_s: float = 0.008
-    """Time between the joint angles and the flange pose of one state."""
+    """Delay between the joint angles and the flange pose of one state."""
     sensor_age_moving_s: float = 0.1
     sensor_age_holding_s: float = 0.5
     """Longest time without a new sample while the arm moves, and while it stands."""

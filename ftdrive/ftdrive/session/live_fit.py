@@ -220,7 +220,7 @@ def _pointing_down(gravity_flange: Array) -> str:
 
 
 def _light(coverage: Prediction, *, loaded: bool = False) -> str:
-    """Return the light by the conditioning; never green with few poses or if another solution explains them."""
+    """Return the light from the conditioning; never green with few poses or if another solution explains them."""
     values = {"cond9": coverage.cond9, "cond_u1": coverage.cond_u1}
     if loaded:
         values = {name: values[name] for name in OF_A_LOAD}

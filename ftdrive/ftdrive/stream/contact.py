@@ -26,7 +26,7 @@ from ftdrive.stream.samples import Ns, Paired
 
 # Rotation of the tool after which the covariance of the prediction is evaluated again.
 _TURN_RAD = 0.02
-# Sigmas of the acceleration of a moving arm: unknown, predicted from past poses, and unknown angular acceleration.
+# Sigmas of the acceleration of a moving arm: linear if unknown, linear if predicted from past poses, and angular.
 _UNKNOWN_M_S2, _COARSE_M_S2, _UNKNOWN_RAD_S2 = 1.0, 0.3, 2.5
 # Timing error of a predicted wrench, in addition to the delay error, because accelerations are means over some time.
 _INEXACT_S = 0.005

@@ -93,8 +93,8 @@ _EMPTY = _NO_PART / 100
 _PART_READ = 0.02
 # The torque is linearised about the centre of mass of the part if its sigma is less than this.
 _PLACED_M = 0.03
-# Prior weight of the expected noise, in windows: small, because vibration is less in a window than in the readings from
-# which the noise is expected. The estimate averages over at most the second number of windows.
+# Prior weight of the expected noise, in windows: small, because a window shows less vibration than the readings from
+# which the noise is predicted. The estimate averages over at most the second number of windows.
 _FIRST_WINDOWS, _MOST_WINDOWS = 3, 200
 
 

@@ -175,7 +175,7 @@ class ToolMonitor:
             if self.track == "off":
                 continue
             for event in events:
-                # Without a part, the contact test reports contacts; a part that is not applied hides contacts from it.
+                # The contact test reports contacts, except those hidden from it by a tracked part that is not applied.
                 if event.kind != "contact" or (self.tool.held is None and tracked.part_kg > NOTHING_KG):
                     self._note(event.kind, event.text, event.values, event.t_host_ns)
             if self.track != "apply":

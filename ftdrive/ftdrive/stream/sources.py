@@ -103,7 +103,7 @@ class SampleSource(ABC):
 
 
 class CellSource(SampleSource):
-    """Samples from the sensor of a cell, paired with the poses of its arm; without a calibration, of the sensor alone.
+    """Samples from the sensor of a cell, paired with the poses of its arm; without a calibration, the sensor alone.
 
     Parameters
     ----------

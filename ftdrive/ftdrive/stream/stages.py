@@ -465,7 +465,7 @@ class FreeTool:
 
 
 def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Mapping[str, JSON]]:
-    """Estimate the bias from the last `TARE_S` seconds; return the update, None if refused, the text and the values.
+    """Estimate the bias from the last `TARE_S` seconds; return the update (None if refused), a text, and values.
 
     A tare is refused if the arm moves, if the reading changes, or if the reading differs from the prediction for a free
     tool by more than noise, calibration and typical drift explain (significance 0.001). The values are the `change` of

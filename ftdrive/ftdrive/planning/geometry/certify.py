@@ -98,7 +98,7 @@ class Certifier:
         return Certifier(ArmModel(arm.name, arm.tool, own), self.scene, self.margins)
 
     def reach_m(self, off_rad: Array) -> float:
-        """Return a bound on how far any two bodies approach if each joint is off by up to `off_rad` (6,), m."""
+        """Return a bound on how far two bodies approach each other if each joint is off by up to `off_rad` (6,), m."""
         return float((self._lever_m @ np.abs(off_rad)).max())
 
     def keeping(self, more_m: float) -> "Certifier":
