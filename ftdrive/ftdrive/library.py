@@ -436,7 +436,7 @@ def check_known_load(
 ) -> tuple[LoadCheck, int, float]:
     """Average the load at rest until enough poses are combined or a recording ends, and compare it with the known load.
 
-    A recording is tared by the last rest of the free tool before the load. Return the check, the number of poses, and
+    A recording is tared at the last rest of the free tool before the load. Return the check, the number of poses, and
     the time since the tare, s.
     """
     scale, refusal, best, due_ns = Scale(stream), CannotWeigh("samples"), None, 0

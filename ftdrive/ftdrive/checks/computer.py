@@ -36,7 +36,7 @@ _LEAST_BYTES, _FEW_BYTES = 200_000_000, 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class SensorAddress:
-    """Address of a sensor in parts: protocol, port or host, options."""
+    """Address of a sensor, split into protocol, port or host, and options."""
 
     scheme: str
     address: str

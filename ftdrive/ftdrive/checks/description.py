@@ -243,7 +243,7 @@ class Description:
         return cell
 
     def found(self) -> dict[str, str]:
-        """Return the reports of robot and sensor by role."""
+        """Return the reports from the robot and the sensor, by role."""
         return {name: self.reports.get(key, _SILENT) for name, key in (("robot", ROBOT), ("sensor", SENSOR))}
 
     def file(self) -> str:

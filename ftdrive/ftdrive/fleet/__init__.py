@@ -1,1 +1,1 @@
-"""Fleets of cells: states, findings across cells, metrics, and solving of many runs again."""
+"""Fleets of cells: states, findings across cells, metrics, and the re-solving of many runs."""

@@ -141,8 +141,8 @@ class ProgramService(Sink):
             self._write()
 
     def end(self) -> None:
-        """Write that the service has stopped, and close the registers."""
-        # Ctrl-C may come while the thread starts; the thread must end before the cell.
+        """Write to the registers that the service has stopped, and close them."""
+        # Ctrl-C may arrive while the thread starts; the thread must end before the cell.
         self._ends.set()
         if self._watching.ident is not None:
             self._watching.join()

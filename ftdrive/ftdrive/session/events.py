@@ -123,7 +123,7 @@ class Planned(Event):
     plan: Plan
     """The plan; `to_dict` gives the contents of its file."""
     way_rad: Array
-    """Joint vectors (k + 1, 6) of the approach to the first pose; (0, 6) if the arm stands there."""
+    """Joint vectors (k + 1, 6) of the approach to the first pose; (0, 6) if the arm is already there."""
     way_words: str
     stop_words: str = ""
     """Stopping distance of the arm, in words; empty for an arm whose driver comes from another package."""
@@ -216,7 +216,7 @@ class Compared(Event):
     stop: int
     number: int
     residual: Array
-    """(6,) measured minus predicted, N and N·m."""
+    """(6,) measured minus predicted wrench, N and N·m."""
     sigma: Array
     """(6,) standard deviation of the residual, from noise and calibration, N and N·m."""
     poses: int

@@ -31,7 +31,7 @@ from ftdrive.session.events import Estimated
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
 # Limits of amber, as for gravity directions 30 to 45 degrees apart.
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
-# A run with a load is judged by cond_u1 alone: a hanging load limits the tilt, and the run of the tool covers cond9.
+# A run with a load is judged by cond_u1 alone: a hanging load limits the tilt, and the tool-only run covers cond9.
 OF_A_LOAD = ("cond_u1",)
 # Largest tilt in a hint while a load hangs from the tool, with a margin for rounding.
 HUNG_TILT_RAD = float(np.radians(76))

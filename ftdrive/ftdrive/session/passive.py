@@ -33,7 +33,7 @@ GOOD: Final = 2
 
 
 def take_passively(session: OpenSession) -> Run:
-    """Record the free tool in motion, see `record_passively`; return the run."""
+    """Record the free tool in motion (see `record_passively`); return the run."""
     run = session.new_run()
     known = circumstances_of(run)
     record_passively(session.cell, run, session.options.seconds, known.setup, known.g_m_s2)

@@ -56,7 +56,7 @@ class Before:
     quiet: FtSamples
     """Samples of the resting sensor over `LISTEN_S`."""
     resumed: bool
-    """Whether a part of the plan was driven before."""
+    """Whether part of the plan has been driven before."""
     task: Task
 
     def quiet_std(self, average_s: float) -> Array:

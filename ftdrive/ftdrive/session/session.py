@@ -95,7 +95,7 @@ def _meaning(config: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]]) 
 
 @dataclass(frozen=True, eq=False)
 class Calibrating:
-    """The task of a calibration."""
+    """The task of a session that calibrates."""
 
     command: ClassVar[str] = "calibrate"
     goal: ClassVar[str] = "the coverage is green"

@@ -41,7 +41,7 @@ HOLDS_POSES: Final = 3
 
 @dataclass(frozen=True, eq=False)
 class Verifying:
-    """The task of a verification."""
+    """The task of a session that verifies a calibration."""
 
     command: ClassVar[str] = "verify"
     load: ClassVar[None] = None

@@ -162,7 +162,7 @@ class FreeToolFilter:
         self._is_doubtful = self._is_warned = False
         self._subtracted = np.zeros(6)
         self.changes = 0
-        """Counter of changes of the state."""
+        """Number of changes of the state so far."""
         # States before each tare, to undo the tare.
         self._untared: list[tuple[_State, Array]] = []
 

@@ -96,7 +96,7 @@ class MotionTracker:
             self._earlier = np.repeat(poses[:, :1], 3 * k, axis=1)
         poses = np.concatenate([self._earlier, poses], axis=1)
         self._earlier = poses[:, n:].copy()
-        # means, because joint noise of single poses looks like motion
+        # use means, because the joint noise of single poses looks like motion
         sums = np.cumsum(poses, axis=1) / k
         moved = sums[:, 2 * k :] - 2 * sums[:, k:-k] + sums[:, : -2 * k]
         before, moved = moved[:, :n], moved[:, k:]

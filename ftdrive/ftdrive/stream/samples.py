@@ -122,7 +122,7 @@ class Block(Paired):
     chi2: Array
     """(n,) squared Mahalanobis distance of the last 20 ms from a free tool, with inertia subtracted as far as known."""
     in_contact: NDArray[np.bool_]
-    """(n,) contact, see `Sample.in_contact`."""
+    """(n,) whether in contact; see `Sample.in_contact`."""
     sigma: Array
     """(6,) standard deviation of the newest sample of `wrench`, N and N·m, in `frame`: noise, calibration, and errors
     of the sensor under the current contact."""
