@@ -26,7 +26,7 @@ from ftdrive.stream.sources import Read, SampleSource
 from ftdrive.stream.stream import Sink, Stream, pump
 from ftdrivers.interfaces import Array
 
-# Time at the beginning of a recording from which the noise is estimated, s.
+# Duration of the first part of a recording, from which the noise is estimated, s.
 _NOISE_S = 30.0
 _OF_FORCE_AND_TORQUE = np.kron(np.eye(2), np.ones((3, 1)))
 # Events that are copied to the compensated recording.
@@ -46,10 +46,10 @@ def source_to_compensate(
     everything: bool,
     say: Callable[[str], object],
 ) -> tuple[AnyRecording, dict[str, float] | None]:
-    """Return the recording with its calibration, and for a recording of another program the delay and its sigma.
+    """Return the recording with its calibration, and for a recording from another program the delay and its sigma.
 
     `name` names the calibration, `delay_s` is a number, "auto" or None. With `everything`, all columns are read. `say`
-    receives a text about what was recognised in tables.
+    receives a description of what was recognised in the tables.
     """
     try:
         tables = tables_of(path, options.table, options.pair, options.topics)
@@ -83,17 +83,17 @@ def compensate_recording(
     estimate_bias: bool = False,
     show: Callable[[str], object] = lambda _: None,
 ) -> tuple[dict[str, Any], BaseException | None]:
-    """Compensate a recording with the calibration in its header; bias and gravity are subtracted.
+    """Compensate a recording with the calibration in its header: subtract the bias and gravity.
 
-    The recording is read once, after its beginning was read for the noise, and once more before that for
-    `estimated_bias`. The result is given in `frame`. `output` is a new recording for the result and the events that
-    still apply. `show` receives a text about the progress.
+    Its beginning is read to estimate the noise, then all of it; `estimate_bias` first reads it once more. The result is
+    given in `frame`. `output` is a new recording for the result and the events that still apply. `show` receives
+    progress messages.
 
-    Returns samples, duration_s, gaps; `raw` and `compensated` with root mean square and maximum of force in N and
-    torque in N·m; `contacts` with time since the first sample in s, duration in s, peak in N and direction;
-    `bias_change`, if estimated; axes, about; calibration (its name) and its marks; `cut`, why the recording ends early;
-    `delay_s`, the last delay in the recording, with value and sigma. The second value is the damage or Ctrl-C that
-    ended the recording early, or None: numbers and file then contain what was before.
+    Returns samples, duration_s, gaps; `raw` and `compensated`, each with the root mean square and the maximum of the
+    force in N and the torque in N·m; `contacts` with time since the first sample in s, duration in s, peak in N and
+    direction; `bias_change`, if estimated; axes, about; calibration (its name) and its marks; `cut`, why the recording
+    ends early; `delay_s`, the last delay in the recording, with value and sigma. The second value is the damage or
+    Ctrl-C that ended the pass early, or None; the numbers and the file then cover only the samples before it.
 
     Raises `ConfigError` for a frame that needs a missing setting, `BadDataset` for a recording that is too short for an
     estimate, `BadRecording` if its first block is damaged, and `OSError` if the result cannot be written; its message
@@ -134,7 +134,7 @@ def compensate_recording(
 
 
 class _Blocks(SampleSource):
-    """A recording of any length as a source without waiting, with the events that still apply."""
+    """A recording of any length as a source that never waits, with the events that still apply."""
 
     def __init__(self, recording: AnyRecording, info: StreamInfo, show: Callable[[str], object]) -> None:
         self.info, self._recording, self._show = info, recording, show
@@ -150,7 +150,7 @@ class _Blocks(SampleSource):
         self._coming.close()
 
     def beginning(self) -> Iterator[Paired]:
-        """Yield the first samples; damage after them is left to the next pass."""
+        """Yield the first samples; the next pass reports any damage after them."""
         left = round(_NOISE_S * self.info.sensor_rate_Hz)
         with suppress(BadDataset, BadRecording):
             for block in self._recording.blocks():
@@ -168,7 +168,7 @@ class _Blocks(SampleSource):
                 raise
             self.failure = error
         if measured is None and self._newest is not None:
-            # process the samples that wait for later poses
+            # process the samples that are waiting for later poses
             self.has_ended = True
             return Read(self._newest.rows(slice(0)))
         elif measured is None:
@@ -228,13 +228,13 @@ class _RunningSums(Sink):
 def estimated_bias(
     source: AnyRecording, *, show: Callable[[str], object] = lambda _: None
 ) -> tuple[Header, dict[str, list[float]]]:
-    """Estimate the bias from a recording of a mostly free tool; keep all other parameters and their uncertainty.
+    """Estimate the bias from a recording with a mostly free tool; keep the other parameters and their uncertainty.
 
-    The estimate is the mean residual of the calibration in readings of 0.1 s. Readings far from the median, such as
-    contacts, do not count. Its covariance includes the error of the kept parameters at the mean orientation, and the
-    scatter of the readings with its correlation in time. Returns the header with the new calibration, and
-    `value`, new minus old bias, and `sigma`, one standard deviation of the new one: 6 numbers each, N and N·m. Raises
-    `BadDataset` for a recording that is too short.
+    The bias changes by the mean residual of readings averaged over 0.1 s. Readings far from the median, such as
+    contacts, are excluded. The covariance includes the error of the kept parameters at the mean orientation, and the
+    scatter of the readings with its correlation in time. Returns the header with the new calibration, and `value`, new
+    minus old bias, and `sigma`, one standard deviation of the new one: 6 numbers each, N and N·m. Raises `BadDataset`
+    for a recording that is too short.
     """
     info = source.header.info
     calibration = info.calibration
@@ -274,7 +274,7 @@ def estimated_bias(
 
 
 def _near_median(reading: Array) -> NDArray[np.bool_]:
-    """Return which readings (n, 6) are not outliers, by their distance from the median of the rest, iteratively."""
+    """Return a mask (n,) of the readings (n, 6) near the median of those kept, found iteratively."""
     free = np.ones(len(reading), bool)
     for _ in range(20):
         centre = np.median(reading[free], axis=0)

@@ -17,7 +17,7 @@ from ftdrive.recording.table_files import CsvFile, ParquetFile, read_csv, read_p
 from ftdrivers.installation import missing_extra
 
 RecordingFile = McapFile | CsvFile | ParquetFile
-"""A new file of one format. After any error, `samples` samples remain in the file."""
+"""A new file in one format. After any error, the first `samples` samples remain in the file."""
 
 
 class _RecordingFormat(NamedTuple):
@@ -51,7 +51,7 @@ def format_of(path: Path) -> _RecordingFormat:
 
 
 def grown_as(path: Path) -> Path:
-    """Return the file that a stream is written to: MCAP first for formats that are unreadable until complete."""
+    """Return the file that a stream is written to: MCAP at first for formats that are unreadable until complete."""
     return path if format_of(path).new.grows else path.with_name(f"{path.name}.mcap")
 
 
@@ -121,11 +121,11 @@ class RecordingReader:
 
 
 def load_recording(path: str | Path, columns: Collection[str] = ROW.names or ()) -> Recording:
-    """Read a recording of `RecordingReader` into memory.
+    """Read a whole recording into memory, with `RecordingReader`.
 
     Raises for a damaged or empty file. A truncated file is read to its end; `cut` then gives the reason.
     """
-    # A damaged file raises, because a caller in Python would not see a printed message.
+    # Damage raises an error, because a caller in Python would not see a printed message.
     reader = RecordingReader(Path(path), columns)
     pieces = list(reader.pieces())
     events = [event for piece in pieces for event in piece.events]

@@ -1,4 +1,4 @@
-"""Recordings of other programs: recognising and reading them as tables, and pairing wrench and pose.
+"""Recordings of other programs: recognise them, read them as tables, and pair wrenches and poses.
 
 Tables are text files or ROS 1 and ROS 2 bags, which need the extra `ros2`.
 """
@@ -91,7 +91,7 @@ def tables_of(
     pair: tuple[Path, Path] | None = None,
     topics: tuple[str | None, str | None] = (None, None),
 ) -> tuple[Table, Table] | None:
-    """Return the tables of wrench and poses, possibly the same table; None for a recording of ftdrive.
+    """Return the table of wrenches and the table of poses, possibly the same one; None for a recording of ftdrive.
 
     `source` is a Path, a DataFrame or a mapping. Raises `BadDataset`, `ConfigError` or `OSError`.
     """
@@ -126,10 +126,10 @@ def table_words(tables: tuple[Table, Table]) -> str:
 
 
 def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tuple[Table, Table]:
-    """Read wrench and pose; the times come from the headers and count from the earliest of both.
+    """Read wrenches and poses; the times come from the headers and count from the earliest message.
 
-    The topics of WrenchStamped and PoseStamped may be omitted if there is only one of each. `pose_topic` may also be
-    like the address of an arm: ``tf?base=base&flange=tool0`` or ``/joint_states?urdf=arm.urdf&flange=tool0``. Raises
+    The topics of WrenchStamped and PoseStamped may be omitted if there is only one of each. `pose_topic` may also have
+    the form of an arm address: ``tf?base=base&flange=tool0`` or ``/joint_states?urdf=arm.urdf&flange=tool0``. Raises
     `ConfigError` if the package rosbags is missing or a topic must be given, and `BadDataset`.
     """
     try:
@@ -190,14 +190,14 @@ def _read_topics(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[_
 
 
 def _number_column(reader: "AnyReader", topic: str, messages: Sequence[_Message], count: int) -> _Column:
-    """Return times (n,) in ns, of receipt if no message has a stamp, and the numbers (n, count) after the header."""
+    """Return times (n,) in ns (of receipt if no message has a stamp), and the numbers (n, count) after the header."""
     if not messages:
         raise BadDataset(f"{topic} has no message: give another topic")
     received_ns = np.array([received for received, _ in messages])
     data = [one for _, one in messages]
     if reader.is2 and data[0][:2] != b"\0\1":
         raise BadDataset(f"{topic} is not encoded as little-endian CDR: record it again with the default RMW")
-    # ROS 1 begins with a counter, ROS 2 with four bytes for the encoding. In ROS 2, numbers begin at multiples of 8.
+    # ROS 1 begins with a counter, ROS 2 with four encoding bytes. In ROS 2, numbers are aligned to multiples of 8.
     (length,) = struct.unpack_from("<I", data[0], 12)
     start = 4 + -(-(12 + length) // 8) * 8 if reader.is2 else 16 + length
     if {len(one) for one in data} != {len(data[0])} or len(data[0]) < start + 8 * count:
@@ -245,7 +245,7 @@ def _pose_column(reader: "AnyReader", named: PoseReader, messages: Mapping[str, 
         return t_ns, np.hstack([quaternion, position])
     decoded: Iterator[tuple[str, Any]] = (
         (topic, reader.deserialize(data, named.topics[topic]))
-        # Latched messages on /tf_static may be late in a bag, so they come first here.
+        # Latched messages on /tf_static may be stored late in a bag, so they are put first here.
         for topic in sorted(named.topics, key=lambda topic: topic != "/tf_static")
         for _, data in messages[topic]
     )
@@ -272,10 +272,10 @@ def _pose_column(reader: "AnyReader", named: PoseReader, messages: Mapping[str, 
 
 
 class TablePair:
-    """Two tables, or one with both streams, as one recording of any length; the devices are unknown.
+    """Two tables, or one table with both streams, as one recording of any length; the devices are unknown.
 
-    `name` names the calibration, and `delay_s` is the delay of the wrench after the orientation; None estimates it in a
-    separate pass. Raises `BadDataset` if a table cannot be used, or the tables do not overlap in time.
+    `name` names the calibration, and `delay_s` is the delay of the wrench relative to the orientation; None estimates
+    it in a separate pass. Raises `BadDataset` if a table cannot be used, or if the tables do not overlap in time.
     """
 
     cut = ""
@@ -312,7 +312,7 @@ class TablePair:
                 yield from (block.rows(slice(i, i + PIECE_ROWS)) for i in range(0, len(block), PIECE_ROWS))
 
         paired = pair_blocks(samples(), _states_of(self._orientation), self.delay_s)
-        # Blocks of the same size as for other recordings, because the contact test proceeds block by block.
+        # The blocks are as large as for other recordings, because the contact test works block by block.
         return in_blocks(Measured(block, (), share[0]) for block in paired)
 
     def _estimated_delay(self) -> tuple[float, float]:
@@ -348,7 +348,7 @@ def _mean_samples(table: Table, size: int) -> Iterator[FtSamples]:
 
 
 def _numbered_samples(table: Table) -> Iterator[tuple[FtSamples, float]]:
-    """Yield the samples, numbered by their times, and the share of the table that is read."""
+    """Yield the samples, numbered by their times, and the share of the table read so far."""
     known, number = 0, 0
     t_s, wrench, place = np.empty(0), np.empty((0, 6)), 0.0
     for rows in chain(table.wrenches(), [None]):
@@ -368,10 +368,10 @@ def _numbered_samples(table: Table) -> Iterator[tuple[FtSamples, float]]:
 
 
 def sample_numbers(t_s: Array) -> NDArray[np.int64]:
-    """Number samples by their times (n,), so that a missing sample is a gap and a late sample is not.
+    """Number samples by their times (n,), so that a missing sample leaves a gap and a late sample does not.
 
     If all times are near multiples of the period, a longer step is a gap. Otherwise, as for times of receipt or of
-    batches, a gap is a step after which the samples stay late by at least a period, in the median and for the earliest.
+    batches, a gap is a step after which the samples stay late by at least a period, in the median and at the earliest.
     """
     steps_s = np.diff(t_s)
     if (step_s := float(np.median(steps_s))) > 0:
@@ -379,7 +379,7 @@ def sample_numbers(t_s: Array) -> NDArray[np.int64]:
         if steps.min() >= 1 and np.abs(steps_s / step_s - steps).max() < _REGULAR:
             return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
     number = np.arange(len(t_s))
-    # the period is estimated from all samples, including missing ones
+    # the period is estimated from the number of all samples, including missing ones
     for _ in range(_ROUNDS):
         before, number = number, _with_gaps(t_s, float(t_s[-1] - t_s[0]) / int(number[-1]))
         if np.array_equal(number, before):

@@ -39,7 +39,7 @@ class GrowingFile:
         return start
 
     def complete(self) -> None:
-        """Write the end, sync the file to disk and rename it. Raises `OSError`, also if the name exists."""
+        """Write the end, sync the file to disk and rename it. Raises `OSError`, also if the new name exists."""
         try:
             self._write_end()
             # Sync before closing releases the lock, because a sync may take seconds.
@@ -50,7 +50,7 @@ class GrowingFile:
         self.partial.rename(self.path)
 
     def _write_end(self) -> None:
-        """Write the end of the format; this class writes nothing."""
+        """Write what ends a file of the format; this class writes nothing."""
 
     def discard(self) -> None:
         """Delete the file."""
@@ -78,7 +78,7 @@ def _lock(file: IO[bytes]) -> bool:
 
 
 def _lock_holder(file: IO[bytes]) -> str:
-    """Return the process that locked a file, from /proc/locks, see proc_locks(5)."""
+    """Return the name of the process that locked a file, from /proc/locks; see proc_locks(5)."""
     with suppress(OSError):
         for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
             _, kind, *_, process, place, _, _ = line.split()
@@ -88,7 +88,7 @@ def _lock_holder(file: IO[bytes]) -> str:
 
 
 def partial_of(path: Path, *, grows: bool) -> Path:
-    """Return the name of an incomplete file. Raises `OSError` if it or the file exists, or the folder does not.
+    """Return the path of the incomplete file. Raises `OSError` if it or `path` exists, or if the folder does not.
 
     `grows` is true if an incomplete file can be read.
     """

@@ -1,11 +1,11 @@
 """Recordings as MCAP, for Foxglove, Lichtblick, PlotJuggler and ROS 2 bags. Needs the extra `record`.
 
-The channels have CDR messages: those of `ftdrive.stream.ros2`, `/ft_sample` with the other columns, `/events`, and
+The channels have CDR messages: those of `ftdrive.stream.ros2`, `/ft_sample` with the remaining columns, `/events`, and
 `/tf` for viewers. All times are UTC. The attachments `calibration.json` and `recording.json` contain the header. Each
 chunk, each attachment and the data section have a CRC-32.
 
 Several thousand samples are packed as one array into one chunk, because the writer of the package `mcap` takes messages
-one by one, which needs half a core at 7 kHz. Format: https://mcap.dev/spec
+one by one, which uses half a CPU core at 7 kHz. Format: https://mcap.dev/spec
 """
 
 import io
@@ -65,21 +65,21 @@ _COLUMNS: Final[Mapping[int, tuple[Any, int]]] = {
     _CHANNELS[ros2.JOINTS]: (np.dtype([("q_rad", "<f8", 6)]), 8),
     _CHANNELS[SAMPLE]: (np.dtype(_SAMPLE), 0),
 }
-# Time between two messages on /tf, ns: no screen shows more.
+# Time between two messages on /tf, ns: no screen is redrawn more often.
 _TRANSFORMS_STEP_NS: Final = 16_666_667
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _ATTACHMENT, _DATA_END = 3, 4, 5, 6, 7, 9, 15
 # Marks the end of a truncated file; not an opcode of MCAP.
 _CUT = 0
-# Layout before the body of a message.
+# Layout of the fields before the body of a message.
 _HEAD: Final = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
 _NONE: Final = np.zeros(0, np.int64)
 
 
-# Times (n,), sequence numbers, and for each topic its n messages; messages of one time are consecutive.
+# Times (n,), sequence numbers, and the n messages of each topic; messages with the same time are consecutive.
 _Group = tuple[NDArray[np.int64], ArrayLike, Mapping[str, ros2.Messages]]
 
 
@@ -166,7 +166,7 @@ class McapFile(GrowingFile):
                     yield np.array([event.t_host_ns + offset_ns]), 0, {topic: np.frombuffer(packed, f"V{len(packed)}")}
 
     def _messages(self, groups: Sequence[_Group]) -> tuple[memoryview, dict[int, NDArray[np.uint64]]]:
-        """Return the messages of a chunk, valid until the next call, and per channel their times and offsets (n, 2)."""
+        """Return a chunk's messages, valid until the next call, and the times and offsets (n, 2) of each channel."""
         widths = [sum(_HEAD.itemsize + body.itemsize for body in bodies.values()) for *_, bodies in groups]
         messages = self._room(sum(len(t_ns) * width for (t_ns, *_), width in zip(groups, widths, strict=True)))
         tables, place = defaultdict(list), 0
@@ -186,7 +186,7 @@ class McapFile(GrowingFile):
         return messages.data, {number: np.concatenate(parts).astype("<u8") for number, parts in tables.items()}
 
     def _room(self, size: int) -> NDArray[np.uint8]:
-        """Return the first bytes of a reused buffer: allocating one per chunk takes a third of the time."""
+        """Return the first bytes of a reused buffer: allocating one per chunk would take a third of the time."""
         if size > len(self._memory):
             self._memory = np.concatenate([self._memory, np.empty(2 * size - len(self._memory), np.uint8)])
         return self._memory[:size]
@@ -230,7 +230,7 @@ def _pack_samples(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, 
 
 
 def _pack_log(event: StreamEvent, offset_ns: int) -> bytes:
-    """Pack an event as Log: the kind as name, the values in `function` as JSON."""
+    """Pack an event as a Log message: the kind as its name, the values as JSON in `function`."""
     stamp = divmod(event.t_host_ns + offset_ns, 1_000_000_000)
     packed = struct.pack("<iIB3x", *stamp, 30 if event.kind in ros2.WARNINGS else 20)
     for text in (event.kind, event.text, "", json.dumps(dict(event.values))):
@@ -240,14 +240,14 @@ def _pack_log(event: StreamEvent, offset_ns: int) -> bytes:
 
 
 def _pack_load(event: StreamEvent) -> bytes:
-    """Pack a weighing, which is also among the events; unknown values are NaN."""
+    """Pack a weighing, which is also stored as an event; unknown values are NaN."""
     values, nowhere = event.values, [np.nan] * 3
     com_m, sigma_m = values["p_sensor_com_m"] or nowhere, values["p_sensor_com_sigma_m"] or nowhere
     return struct.pack("<8d", values["mass_kg"], values["mass_sigma_kg"], *com_m, *sigma_m)
 
 
 def _pack_tracked(event: StreamEvent) -> bytes:
-    """Pack tracked bias and part; an unknown age is infinite."""
+    """Pack the tracked bias and the part; an unknown age is infinite."""
     values = event.values
     age_s = np.inf if values["last_seen_s"] is None else values["last_seen_s"]
     part = values["part_kg"], values["part_sigma_kg"], age_s, values["part_known"]
@@ -328,7 +328,7 @@ def _mcap_header(documents: Mapping[str, Any]) -> Header:
 
 
 def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Yield the complete records of the data section, and `_CUT` if its end is missing.
+    """Yield the complete records of the data section, then `_CUT` if its end is missing.
 
     Raises `ValueError` if the CRC does not match, or if the file was completed without the end of the data.
     """
@@ -359,7 +359,7 @@ def _require_crc(crc: int, stored: bytes) -> None:
 
 
 class _Content:
-    """Columns and events of the chunks since the last piece, with times of the cell's clock."""
+    """Columns and events of the chunks since the last piece, with times on the cell's clock."""
 
     def __init__(self, header: Header, columns: Collection[str]) -> None:
         self._header = header
@@ -418,7 +418,7 @@ class _Content:
 
 
 def _read_index(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the channel of an index, and times, starts and ends (n,) of its messages, after comparing it with them."""
+    """Return an index's channel, and the times, starts and ends (n,) of its messages, after comparing it with them."""
     channel, size = struct.unpack_from("<HI", index)
     t_ns, places = np.frombuffer(index, "<i8", size // 8, 6).reshape(-1, 2).T
     heads = _gather(messages, places, _HEAD)
@@ -429,7 +429,7 @@ def _read_index(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], 
 
 def _require_complete(messages: bytes, places: NDArray[np.int64], ends: NDArray[np.int64]) -> None:
     """Raise `ValueError` if there is anything but schemas and channels between the indexed messages."""
-    # only the offsets of each channel are in order
+    # only the offsets within each channel are in order
     order = np.argsort(places, kind="stable")
     begins, stops = np.append(places[order], len(messages)), np.insert(ends[order], 0, 0)
     for stop, begin in zip(stops[stops != begins].tolist(), begins[stops != begins].tolist(), strict=True):
@@ -444,7 +444,7 @@ def _require_complete(messages: bytes, places: NDArray[np.int64], ends: NDArray[
 
 
 def _gather(data: bytes, places: NDArray[np.int64], kind: np.dtype[Any]) -> NDArray[Any]:
-    """Return the values at these offsets; without a copy if the offsets are equidistant."""
+    """Return the values at these offsets, without a copy if the offsets are equidistant."""
     if len(places) and (places.min() < 0 or places.max() + kind.itemsize > len(data)):
         raise ValueError("an index points outside its chunk")
     steps = np.diff(places)

@@ -1,4 +1,4 @@
-"""Writers of recordings: files written together, recorders of a stream and of raw readings, and conversion."""
+"""Writers of recordings: files written together, recorders for a stream and for raw readings, and conversion."""
 
 import signal
 import threading
@@ -26,7 +26,7 @@ from ftdrive.recording.recording import ROW, Header, Rows, read_ahead, split_pie
 from ftdrive.stream.samples import Block, StreamEvent, StreamInfo
 from ftdrive.stream.stream import Sink, Stream
 
-# Duration of the samples in one write, ns; the stream waits for a few ms during each write.
+# Duration of the samples in one write, ns; each write delays the stream by a few ms.
 _FLUSH_NS = 200_000_000
 
 
@@ -46,9 +46,9 @@ class RecordingFiles:
             stack.pop_all()
 
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
-        """Write samples of one frame, and the events since the previous samples.
+        """Write samples in one frame, and the events since the previous samples.
 
-        Raises `OSError`; then no file is completed, and the message names what each `.partial` contains.
+        Raises `OSError`; then no file is completed, and the message states what each `.partial` contains.
         """
         with _delay_signals():
             try:
@@ -65,7 +65,7 @@ class RecordingFiles:
     def complete(self) -> None:
         """Complete all files with every sample.
 
-        Raises `OSError` if a file could not be completed; its message names what each `.partial` contains.
+        Raises `OSError` if a file could not be completed; its message states what each `.partial` contains.
         """
         files, self._files, failure = self._files, [], None
         with _delay_signals():
@@ -103,12 +103,12 @@ class RecordingFiles:
 class Recorder(Sink):
     """Writes a stream to new files, .mcap, .csv or .parquet by suffix, from the first sample on.
 
-    Changes of frame and stages become events with the time of the first sample after them. An incomplete Parquet file
-    cannot be read, so `x.parquet` is recorded as `x.parquet.mcap` and converted at the end. If the stream is
-    `repeatable`, such as a recording, Parquet is written directly. `configuration` of the cell is stored in the header.
-    `duration_s` and `count` limit the recording; at the limit, `is_complete` is true.
+    Changes of the frame or the stages become events with the time of the first sample after them. An incomplete Parquet
+    file cannot be read, so `x.parquet` is recorded as `x.parquet.mcap` and converted at the end. If the stream is
+    `repeatable`, such as a recording, Parquet is written directly. The `configuration` of the cell is stored in the
+    header. `duration_s` and `count` limit the recording; at the limit, `is_complete` is true.
 
-    Raises `ConfigError` for an unknown suffix or a missing package, `OSError` for an existing file or a missing folder.
+    Raises `ConfigError` for an unknown suffix or a missing package, `OSError` if a file exists or its folder does not.
     """
 
     label, keeps_all = "recording", True
@@ -129,7 +129,7 @@ class Recorder(Sink):
         self.samples, self.gaps, self.lost = 0, 0, 0
         self.first_ns = self.last_ns = 0
         self.show: Callable[[str], object] = lambda _: None
-        """Receives the progress as text, because the final conversion may take a minute per hour of samples."""
+        """Receives progress messages, because the final conversion may take a minute per hour of samples."""
         require_new_recordings(paths)
         self._info, self._configuration = info, configuration
         self._grown = {path if repeatable else grown_as(path): path for path in paths}
@@ -159,7 +159,7 @@ class Recorder(Sink):
         return (self.samples - 1) / self.duration_s if self.duration_s else 0.0
 
     def begin(self, stream: Stream) -> None:
-        """Keep the stream, whose delay is recorded at the end; a recording has its own delay events."""
+        """Keep the stream to record its delay at the end; a replayed recording has its own delay events."""
         self._stream = None if self._is_repeatable else stream
 
     def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
@@ -177,7 +177,7 @@ class Recorder(Sink):
             if event.kind == "gap":
                 self.gaps += 1
                 self.lost += int(event.values.get("lost", 0))
-        # changes of frame and stages are recorded by `_follow`, with the first sample after them
+        # `_follow` records changes of the frame and the stages, with the first sample after them
         self._events += [event for event in events if event.kind not in ("frame", "stages")]
         if block:
             self._follow(block)
@@ -190,7 +190,7 @@ class Recorder(Sink):
             self.is_complete |= self.samples == self._count
 
     def end(self) -> None:
-        """Complete the files; without a sample there are none. Raises the errors of `RecordingFiles.complete`."""
+        """Complete the files; without samples, none are created. Raises the errors of `RecordingFiles.complete`."""
         if self._stream is not None:
             status = self._stream.status()
             values = {"value": status.delay_s, "sigma": status.delay_sigma_s}
@@ -228,7 +228,7 @@ class Recorder(Sink):
             self._files.discard()
 
     def _follow(self, block: Block) -> None:
-        """Create the files with the first block; record a change of frame or stages."""
+        """Create the files at the first block, and record a change of the frame or the stages."""
         t_ns = int(block.t_host_ns[0])
         if self._header is None:
             self._header, self.first_ns = Header(self._info, block.frame, block.stages, self._configuration), t_ns
@@ -285,7 +285,7 @@ def convert_recording(
     """Convert a recording of any length to a new file; return samples, duration_s and gaps, and what ended it early.
 
     Damage and Ctrl-C end the file after the last valid piece. Raises `BadRecording` if the first piece is damaged, and
-    `OSError` as `RecordingFiles`. `show` receives a text about the progress.
+    the `OSError` of `RecordingFiles`. `show` receives progress messages.
     """
     files = RecordingFiles([target], reader.header)
     failure: BaseException | None = None
@@ -312,7 +312,7 @@ def convert_recording(
 
 @contextmanager
 def _delay_signals() -> Iterator[None]:
-    """Delay Ctrl-C, `kill` and a closing terminal, so that each file gets the whole piece."""
+    """Delay Ctrl-C, `kill` and the closing of the terminal, so that each file gets the whole piece."""
     waiting: list[tuple[Any, Any, Any]] = []
     handlers = {}
     if threading.current_thread() is threading.main_thread():

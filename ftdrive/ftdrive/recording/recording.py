@@ -39,9 +39,9 @@ FORMAT: Final = "ftdrive.recording/1"
 Rows = NDArray[np.void]
 """(n,) records of type `ROW`."""
 PIECE_ROWS: Final = 1 << 13
-"""Number of samples in a piece, which fits the cache."""
+"""Number of samples in a piece, which fits into the processor cache."""
 ZSTD_LEVEL: Final = -5
-"""Compression level of zstd: values with noise in their last digits hardly shrink at any level."""
+"""Compression level of zstd, low because values with noise in their last digits hardly shrink at any level."""
 
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 _GROUPS: Mapping[str, tuple[str, Sequence[str]]] = {
@@ -64,7 +64,7 @@ ROW: Final = np.dtype(
 NEEDED: Final = ("t_host_ns", "seq", "raw", "p_base_flange_m", "quaternion_base_flange")
 """Columns required for compensation."""
 NUMBERS: Final = {name: names or (name,) for name, (_, names) in _GROUPS.items()}
-"""Columns of the table formats for each field of `ROW`."""
+"""Columns in the table formats for each field of `ROW`."""
 
 
 def flat_layout(kind: np.dtype[Any]) -> np.dtype[Any]:
@@ -77,7 +77,7 @@ COLUMNS: Final = flat_layout(ROW)
 
 
 def table_of(rows: Rows, start_ns: int, utc_offset_ns: int) -> dict[str, NDArray[Any]]:
-    """Return the columns of the table formats: times for other programs, then the numbers of the rows.
+    """Return the columns of the table formats: the times for other programs, then the numbers in the rows.
 
     `start_ns` is `t_host_ns` of the first sample of the recording.
     """
@@ -89,14 +89,14 @@ def table_of(rows: Rows, start_ns: int, utc_offset_ns: int) -> dict[str, NDArray
 def places_of(events: Sequence[StreamEvent], rows: Rows) -> list[int]:
     """Return for each event the number of samples before it.
 
-    Samples at the time of an event come before it, except for changes of frame or stages. The order of events is kept.
+    Samples at the time of an event come before it, unless it changes the frame or the stages. Events keep their order.
     """
     after_ns = [event.t_host_ns + (event.kind not in ("frame", "stages")) for event in events]
     return list(accumulate(np.searchsorted(rows["t_host_ns"], after_ns).tolist(), max))
 
 
 def to_records(samples: Block | Paired) -> Rows:
-    """Return samples as records; fields that paired samples lack are 0."""
+    """Return paired samples as records; fields that they lack are 0."""
     rows = np.zeros(len(samples), ROW)
     for name in _GROUPS:
         if hasattr(samples, name):
@@ -120,7 +120,7 @@ def _paired_of(rows: Rows) -> Paired:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Header:
-    """Constant description of a recording, with the frame and stages of its first sample."""
+    """Constant description of a recording, with the frame and the stages at its first sample."""
 
     info: StreamInfo
     frame: WrenchFrame
@@ -157,7 +157,7 @@ class Header:
         """Build the header from the content of a file; unknown fields are ignored. Raises `BadRecording`."""
         check_format(document, FORMAT, BadRecording)
         try:
-            # files of earlier versions lack the fields with defaults
+            # files from earlier versions lack the fields with defaults
             newer = {item.name: item.default for item in fields(StreamInfo) if item.default is not MISSING}
             known = {**newer, "result": None, **document}
             values = {item.name: known[item.name] for item in fields(StreamInfo)}
@@ -191,7 +191,7 @@ def _frame_from_dict(values: Mapping[str, Any]) -> WrenchFrame:
 
 
 def _stages_of(values: Mapping[str, Any]) -> Stages:
-    """Build stages from a header or an event; a stage that is not named did not exist yet and was off."""
+    """Build the stages from a header or an event; a missing stage did not exist at that time, so it was off."""
     usual: dict[str, Any] = {item.name: item.default for item in fields(Stages)}
     off = {name: None if value is None else type(value)() for name, value in usual.items()}
     if newer := [name for name, value in dict(values).items() if value and name not in off]:
@@ -206,7 +206,7 @@ def event_text(event: StreamEvent) -> str:
 
 
 def event_of(text: str) -> StreamEvent:
-    """Build an event from the result of `event_text`. Raises `ValueError`."""
+    """Build an event from a line made by `event_text`. Raises `ValueError`."""
     try:
         values = parsed_json(text)
         return StreamEvent(values["t_host_ns"], values["kind"], values["text"], values["values"])
@@ -265,7 +265,7 @@ def with_calibration(header: Header, calibration: CalibrationResult, name: str) 
 class Recording(Displayed):
     """A recording in memory.
 
-    Events of the kinds "frame" and "stages" mark where these change in the samples; `values` has the new ones.
+    Events of the kinds "frame" and "stages" mark where these change among the samples; `values` has the new ones.
     """
 
     header: Header
@@ -340,14 +340,14 @@ class Recording(Displayed):
 
 
 def next_header(header: Header, event: StreamEvent) -> Header:
-    """Return the header valid after an event. Raises `BadRecording` for a stage of a newer version."""
+    """Return the header valid after an event. Raises `BadRecording` for a stage from a newer version."""
     if event.kind == "frame":
         return replace(header, frame=_frame_from_dict(event.values))
     return replace(header, stages=_stages_of(event.values)) if event.kind == "stages" else header
 
 
 def split_piece(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
-    """Divide samples at changes of frame or stages, and after `PIECE_ROWS`; events stay before the next samples."""
+    """Divide samples at changes of frame or stages, and every `PIECE_ROWS`; events stay before the next samples."""
     n = len(piece.rows)
     events = sorted(piece.events, key=lambda event: event.t_host_ns)
     at = places_of(events, piece.rows)
@@ -361,7 +361,7 @@ def split_piece(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
 
 
 def read_ahead(items: Iterator[T]) -> Generator[T, None, None]:
-    """Yield items while a thread makes the next one; its errors are raised in order."""
+    """Yield items while a thread makes the next one; an error in the thread is raised after the items before it."""
     # One thread reads and one processes. Only the main thread writes, so that errors and Ctrl-C keep their order.
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(next, items, None)
@@ -371,7 +371,7 @@ def read_ahead(items: Iterator[T]) -> Generator[T, None, None]:
 
 
 def in_blocks(parts: Iterable[Measured]) -> Iterator[Measured]:
-    """Yield samples in blocks of `PIECE_ROWS`, for parts of any size, up to an error."""
+    """Yield the samples of parts of any size in blocks of `PIECE_ROWS`, up to an error."""
     waiting, count, events, share, failure = list[Paired](), 0, list[StreamEvent](), 0.0, None
     try:
         for part in parts:

@@ -23,7 +23,7 @@ from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 
 
 def open_replay(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> Stream:
-    """Open the stream of a run folder, a recording (by default with its own calibration) or a table of another program.
+    """Open the stream of a run folder, a recording (by default with its own calibration) or another program's table.
 
     Raises `ConfigError` without a calibration, and `DataError` or `OSError` for a file that cannot be used.
     """
@@ -54,7 +54,7 @@ def is_run_folder(path: Path) -> bool:
 
 
 def source_of_run(run: Run, calibration: CalibrationResult, name: str = "") -> RecordingSource:
-    """Return the poses of a guided run as a source, one after the other; the moves between them were not recorded.
+    """Return the poses of a run as a source, one after the other; the moves between them were not recorded.
 
     `name` names the calibration. Raises `BadDataset` for a damaged run or a run without poses.
     """
@@ -71,7 +71,7 @@ def source_of_run(run: Run, calibration: CalibrationResult, name: str = "") -> R
             Paired(
                 t_host_ns=np.empty(n, np.int64),
                 t_device_s=samples.t_device_s,
-                # keep gaps of lost samples
+                # keep the gaps that lost samples left
                 seq=samples.seq - samples.seq[0] + count,
                 status=samples.status,
                 raw=samples.wrench,

@@ -27,12 +27,12 @@ Moving = Run | Path | tuple[Table, Table]
 
 
 def read_place(place: Path, options: SolveOptions) -> Moving | RecordedData:
-    """Return poses at rest, or a recording in motion, which is read when it is solved. Raises as `read_source`."""
+    """Return poses at rest, or a recording in motion, unread until it is solved. Raises the errors of `read_source`."""
     if any(options.topics) and (options.pair is not None or not is_bag(place)):
         raise ConfigError("--wrench-topic and --pose-topic are only for a ROS bag: leave them out")
     moving: Moving | None
     if is_bag(place) and options.method != "ml":
-        moving = place  # do not read a whole bag only for the error below
+        moving = place  # avoid reading a whole bag only to raise the error below
     elif place.is_dir() and Run(place).in_motion:
         moving = Run(place)
     else:
@@ -43,7 +43,7 @@ def read_place(place: Path, options: SolveOptions) -> Moving | RecordedData:
 
 
 def solve_place(data: Moving | RecordedData, options: SolveOptions) -> CalibrationResult:
-    """Solve the data from `read_place`; with an earlier result, only the tool is new.
+    """Solve the data from `read_place`; with an earlier result, solve only for the tool.
 
     Raises `ConfigError` for values that the method cannot use.
     """
@@ -67,14 +67,14 @@ def solve_recording(
     up_in_base: Sequence[float] | None,
     earlier: CalibrationResult | None = None,
 ) -> CalibrationResult:
-    """Calibrate from a recording in motion, of ftdrive or of another program with one clock, by `solve_motion`.
+    """Calibrate from a recording in motion, from ftdrive or from another program with one clock, by `solve_motion`.
 
     With a known direction of gravity, the base is level with respect to the declared up direction `up_in_base` (3,).
     `earlier` is a result of the same cell with another tool.
 
     Raises `BadDataset`, `BadRecording`, `ConfigError` or `OSError` if a file cannot be used, or if the earlier result
     is rejected or belongs to another sensor or arm. Raises `NotObservable` if the motion does not determine the
-    parameters, or contradicts the earlier result.
+    parameters, or if it contradicts the earlier result.
     """
     provenance, height_m, g_m_s2, any_zero = made_now(), None, STANDARD_GRAVITY_M_S2, False
     accuracy_deg = None
@@ -113,7 +113,7 @@ def solve_recording(
 
 
 def _read_in_motion(source: Path | Recording) -> tuple[Means, Means, Header]:
-    """Return wrench, poses (with positions, if any) and header. Raises the errors of `RecordingReader.pieces`."""
+    """Return wrenches, poses (with positions, if any) and header. Raises the errors of `RecordingReader.pieces`."""
     reader = source if isinstance(source, Recording) else RecordingReader(source, NEEDED)
     wrench, poses = Means(), Means()
     if isinstance(source, Recording) and (missing := {*NEEDED} - {*(source.rows.dtype.names or ())}):

@@ -12,7 +12,7 @@ CSV, for any program:
     # end
 
 A reader that skips lines with `#`, such as `pandas.read_csv(path, comment="#")`, reads a plain table. A file whose
-checksum does not match is refused. In a file without its end, samples are valid up to the last checksum; there is one
+checksum does not match is rejected. In a file without its end, samples are valid up to the last checksum; there is one
 at least every second.
 
 Parquet, for pandas, Polars, DuckDB and MATLAB, is fastest to read. It needs the extra `record`. The footer has
@@ -193,7 +193,7 @@ class ParquetFile(_TableFile):
 
     grows = False
     closed = False
-    """Attribute that pyarrow expects of a file."""
+    """Attribute that pyarrow expects a file to have."""
 
     def __init__(self, path: Path, header: Header) -> None:
         from pyarrow import PythonFile, parquet
@@ -214,7 +214,7 @@ class ParquetFile(_TableFile):
 
     def write(self, content: bytes) -> None:
         """Append bytes encoded by pyarrow. Raises `OSError`."""
-        if not self._file.closed:  # pyarrow also ends a discarded file
+        if not self._file.closed:  # pyarrow writes an end even to a discarded file
             self.add(content)
 
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
@@ -258,7 +258,7 @@ def _text_crc(texts: Mapping[bytes, bytes]) -> str:
 
 
 def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None, str]:
-    """Read a recording in pieces; return "", because a truncated Parquet file is not readable. Raises as `read_csv`."""
+    """Read a recording in pieces; return "", because a truncated Parquet file is unreadable. Raises like `read_csv`."""
     from pyarrow import ArrowException, parquet
 
     with open_file(path) as raw:
@@ -269,12 +269,12 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
                 "interrupted, repeat it. If `record` of an older ftdrive was interrupted, convert it with that version"
             )
     try:
-        # With a buffer, the columns of a large row group are not read at once.
+        # With a buffer, the columns of a large row group are not read all at once.
         with parquet.ParquetFile(path, page_checksum_verification=True, buffer_size=1 << 20) as file:
             texts, total = file.metadata.metadata or {}, file.metadata.num_rows
             if not {b"header", b"events"} <= texts.keys():
                 raise BadRecording("it has no header of ftdrive: another program wrote it")
-            # Files of earlier versions have no checksum here.
+            # Files from earlier versions have no checksum here.
             if texts.get(b"crc32", b"").decode() not in ("", _text_crc(texts)):
                 raise BadRecording("its header differs from its checksum: the file is damaged")
             if not file.schema_arrow.remove_metadata().equals(_arrow_schema()):
@@ -285,7 +285,7 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
             numbers = flat_layout(kind)
             yield Piece(header, np.zeros(0, kind), [], 0.0)
             names, count = {*(numbers.names or ()), "t_host_ns"}, 0
-            for number in range(file.num_row_groups):  # a reader of all row groups would keep their data in memory
+            for number in range(file.num_row_groups):  # one reader for all row groups would keep their data in memory
                 group = file.metadata.row_group(number)
                 if len({group.column(i).compression for i in range(group.num_columns)}) > 1:
                     raise BadRecording("its footer is inconsistent: the file is damaged")  # the footer has no checksum
@@ -303,7 +303,7 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
                 raise BadRecording(f"it has {count} of its {total} samples: the file is damaged")
             yield Piece(header, np.zeros(0, kind), events, 1.0)
     except (ArrowException, MemoryError, OSError, TypeError, ValueError) as error:
-        if getattr(error, "errno", None) is not None:  # an error of the disk; pyarrow sets no errno
+        if getattr(error, "errno", None) is not None:  # a disk error; pyarrow sets no errno
             raise
         why = next(iter(str(error).splitlines()), type(error).__name__)
         raise BadRecording(f"it cannot be read ({why}): the file is damaged") from error
