@@ -1,4 +1,4 @@
-"""A bundle: a run folder as one zip file without addresses and names, which `replay` and `solve` read.
+"""A bundle: a run folder as one zip file without addresses or names, which `replay` and `solve` can read.
 
 bundle.json         ftdrive.bundle/1: name of the run, whether it is emulated, what was redacted, what was left out
 environment.json    versions of all packages, and checks of the computer without devices
@@ -52,15 +52,15 @@ _IPV4 = re.compile(r"(?<![\w.])\d{1,3}(?:\.\d{1,3}){3}(?![\w.]\d|\w)")
 _IPV6 = re.compile(r"(?<![\w:.])[0-9A-Fa-f]*:[0-9A-Fa-f:]+(?![\w:.])")
 _MAC = re.compile(r"(?<![\w:-])(?:[0-9A-Fa-f]{2}[:-]){5}[0-9A-Fa-f]{2}(?![\w:-])")
 _HOST_FIELD = re.compile(r'"host": ?"([A-Za-z0-9.-]+)"|"said": ?{[^}]*"robot": ?"([A-Za-z0-9.-]+)"')
-# Endings of URL schemes whose host part is not a host of the cell.
+# Endings of URL schemes whose host part is no host in the cell.
 _NO_NETWORK = ("can", "emulated", "http", "https", "file")
 # Common names of accounts and hosts, which identify no person; their home directories are redacted.
 _NOT_PERSONAL = {"root", "user", "robot", "ur", "admin", "ubuntu", "operator", "localhost"}
-# Fields whose groups of four numbers are versions, not addresses.
+# Fields in which four numbers separated by dots are versions, not addresses.
 _VERSIONS = ("versions", "packages", "firmware")
-# Smallest share of printable bytes in a text. Other bytes are measurements, which are not changed.
+# Smallest share of printable bytes in a text. Bytes with a smaller share are measurements, which stay unchanged.
 _TEXT_SHARE = 0.9
-# Fields of a transcript with bytes in hexadecimal form.
+# Fields of a transcript that contain bytes in hexadecimal form.
 _ON_THE_WIRE = ("hex", "request", "reply")
 
 
@@ -69,7 +69,7 @@ _Instead = Callable[[str, re.Match[str]], str]
 
 
 class Redaction:
-    """Replaces IP and MAC addresses, host names, user names and home directories by placeholders.
+    """Replaces IP and MAC addresses, host names, user names and home directories with placeholders.
 
     Equal values get equal placeholders. Serial numbers, names of serial ports and loopback addresses are kept. Call
     `learn` with all texts first, because a name that one file reveals may appear without context in another.
@@ -79,7 +79,7 @@ class Redaction:
         self.placeholders: dict[str, str] = {}
         """Placeholder of each redacted value; never written to a file."""
         self._names: dict[str, str] = {}
-        # A container may have no name for its user.
+        # The user of a container may have no name.
         with suppress(OSError, KeyError):
             self._learn_name("user", getpass.getuser())
         self._learn_name("host", platform.node())
@@ -92,7 +92,7 @@ class Redaction:
         return {kind: kinds.count(kind) for kind in sorted(set(kinds))}
 
     def learn(self, text: str) -> None:
-        """Collect names of hosts and users from paths, addresses and host fields of a file."""
+        """Collect the names of hosts and users from the paths, addresses and host fields in a file."""
         for value in _texts_of_file(text):
             for user in _HOME.findall(value):
                 self._learn_name("user", user)
@@ -150,7 +150,7 @@ class Redaction:
         return text
 
     def _wire(self, text: str) -> str:
-        """Return hexadecimal bytes with masked names, if the bytes are text; their number is kept."""
+        """Return hexadecimal bytes with names masked if the bytes are text; the number of bytes is kept."""
         try:
             sent = bytes.fromhex(text)
         except ValueError:
@@ -198,7 +198,7 @@ def _parse_document(text: str) -> JSON | None:
 
 
 def _texts_of_file(text: str) -> Iterator[str]:
-    """Yield the strings in the JSON of a file, without escapes, and its lines that are not JSON."""
+    """Yield the strings in the JSON of a file, unescaped, and its lines that are not JSON."""
     for part in [text] if _parse_document(text) is not None else text.splitlines():
         document = _parse_document(part)
         yield from [part] if document is None else _values(document)
@@ -213,7 +213,7 @@ def _values(value: Any) -> Iterator[str]:
 
 
 FORMAT: Final = "ftdrive.bundle/1"
-# Largest total size of an unpacked bundle, bytes. One hour at 7 kHz is 3 GB.
+# Largest total size of an unpacked bundle, bytes. One hour at 7 kHz takes 3 GB.
 MOST_BYTES: Final = 4_000_000_000
 MOST_FILES: Final = 20_000
 _COPY_AGAIN: Final = "copy the bundle again, or ask for a new one"
@@ -283,7 +283,7 @@ def unpack(source: Path) -> Iterator[Path]:
     Raises
     ------
     BadBundle
-        The file is damaged, is not a bundle, is too large, or has names that lead out of its folder.
+        The file is damaged, is not a bundle, is too large, or contains paths that lead out of its folder.
     """
     if source.suffix.lower() != ".zip" or source.is_dir():
         yield source
@@ -320,7 +320,7 @@ def _run_in(folder: Path) -> Path:
 
 
 def _require_harmless(members: Sequence[zipfile.ZipInfo]) -> None:
-    """Raise `BadBundle` for dangerous names or sizes; `zipfile` reads at most the stated size of a file."""
+    """Raise `BadBundle` for dangerous names or sizes; `zipfile` reads no more than the stated size of a file."""
     if len(members) > MOST_FILES or sum(member.file_size for member in members) > MOST_BYTES:
         limits = f"{MOST_BYTES / 1e9:g} GB or {MOST_FILES} files"
         raise BadBundle(f"its unpacked content exceeds {limits}: do not use this file, or unpack it by hand")
@@ -341,7 +341,7 @@ def _decode_text(content: bytes) -> str | None:
 
 
 def _environment(folder: Path) -> dict[str, Any]:
-    """Return versions, and checks of this computer and of the described cell."""
+    """Return the versions, and the checks of this computer and of the described cell."""
     packages = {about["Name"]: about["Version"] for about in (each.metadata for each in distributions())}
     facts: dict[str, Any] = {
         "versions": versions(),

@@ -1,4 +1,4 @@
-"""Reading of calibrations: origin, values of JSON documents, the sensor matrix, and the marks of a calibration.
+"""Reading of calibrations: their origin, values in JSON documents, the sensor matrix, and the marks of a calibration.
 
 The sensor matrix is in `sensor.json` in the current folder, next to ftdrive.toml. Later matrices are `sensor-2.json`
 and so on; the newest one is used. The matrix belongs to the sensor, so it is used with every tool.
@@ -25,12 +25,12 @@ from ftdrive.cell.config import without_password
 from ftdrive.errors import NotAccepted
 from ftdrive.runs import is_run
 
-# A list of results must not import numpy.
+# Listing results must not import numpy.
 if TYPE_CHECKING:
     from ftcalib import CalibrationResult, SensorMatrix
 
 _NAME: Final = re.compile(r"sensor(?:-(\d+))?\.json")
-# Facts about a sensor that must be unchanged for its matrix to be valid. Counts differ between calibration slots.
+# Properties of a sensor that must not change if its matrix is to stay valid. Counts differ between calibration slots.
 _FACTS: Final = {
     "counts_per_N": "counts per N",
     "counts_per_Nm": "counts per N·m",
@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 EMULATED: Final = "EMULATED"
 EDITED: Final = "EDITED BY HAND"
 FOREIGN: Final = "OF ANOTHER CELL"
-# Marks that every output shows for some calibrations, with their meaning.
+# Marks that every output shows for certain calibrations, with their meaning.
 MARKS: Final[Mapping[str, str]] = {
     EMULATED: "The cell was EMULATED: these are not the values of a real tool.",
     EDITED: "The file was EDITED BY HAND after it was solved: its verdict and sigmas no longer apply to its numbers.",
@@ -52,13 +52,13 @@ MARKS: Final[Mapping[str, str]] = {
 
 
 def made_now() -> dict[str, Any]:
-    """Return the origin that every file records: time, command line and versions."""
+    """Return the origin recorded in every file: time, command line and versions."""
     argv = [without_password(word) for word in sys.argv]
     return {"created_utc": datetime.now(UTC).isoformat(), "argv": argv, "versions": versions()}
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the software that makes a result."""
+    """Return the versions of the software that produces a result."""
     own = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}
     return own | {name: version(name) for name in ("numpy", "scipy", "python-can", "pyserial")}
 
@@ -91,7 +91,7 @@ def numbers_at(document: Any, n: int, *keys: str) -> list[float] | None:
 
 
 def time_at(document: Any, *keys: str) -> str | None:
-    """Return the time at a path of keys as UTC in ISO 8601 with microseconds, which sorts as text; else None."""
+    """Return the time at a path of keys as UTC in ISO 8601 with microseconds, sortable as text; else None."""
     try:
         return datetime.fromisoformat(at(document, *keys)).astimezone(UTC).isoformat(timespec="microseconds")
     except (TypeError, ValueError):
@@ -101,12 +101,12 @@ def time_at(document: Any, *keys: str) -> str | None:
 def read_calibration(path: str | Path, *, accept_edited: bool = False) -> "CalibrationResult":
     """Read a calibration; `CalibrationResult.save` writes it.
 
-    If the current folder has a `sensor.json` of the sensor, the result decodes contacts with it.
+    If the current folder has a `sensor.json` for the sensor, the result decodes contacts with it.
 
     Parameters
     ----------
     path : str or Path
-        A calibration.json, or a run folder with its newest calibration.
+        A calibration.json, or a run folder, of which the newest calibration is read.
     accept_edited : bool
         Whether to accept a file that was edited by hand; the result is then marked by `is_edited`.
 
@@ -162,18 +162,18 @@ def marks_of(calibration: "CalibrationResult", *, emulated: bool = False, foreig
 
 
 def sensor_files(folder: Path = Path()) -> list[Path]:
-    """Return the files of sensor matrices in a folder, the oldest first."""
+    """Return the sensor-matrix files in a folder, the oldest first."""
     return sorted(filter(_file_number, folder.glob("sensor*.json")), key=_file_number)
 
 
 def next_sensor_file(folder: Path = Path()) -> Path:
-    """Return the path of the next sensor matrix."""
+    """Return the path for the next sensor matrix."""
     number = 1 + max(map(_file_number, sensor_files(folder)), default=0)
     return folder / (f"sensor-{number}.json" if number > 1 else "sensor.json")
 
 
 def _file_number(path: Path) -> int:
-    """Return the number in the name of a sensor file; 0 for any other file."""
+    """Return the number in the name of a sensor-matrix file; 0 for any other file."""
     name = _NAME.fullmatch(path.name)
     return int(name[1] or 1) if name else 0
 

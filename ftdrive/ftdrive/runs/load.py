@@ -1,4 +1,4 @@
-"""A weighed load on the tool during a run, from options, run.json or a dataset."""
+"""A load of known mass on the tool during a run, from options, run.json or a dataset."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from ftcalib.sampling import Sampling
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.arm_model import STRING_M, WEIGHT_HEIGHT_M, WEIGHT_RADIUS_M
 
-# Relative standard deviation of a mass without a given sigma, as of a kitchen scale.
+# Relative standard deviation of a mass given without a sigma, as for a kitchen scale.
 MASS_SHARE: Final = 1e-3
 _FARTHEST_MM: Final = 2000.0
 _HEAVIEST_KG: Final = 100.0
@@ -22,7 +22,7 @@ _SWING_ATTEMPTS: Final = 6
 
 
 class Load(KnownLoad):
-    """A weighed load of a session: hanging on a string from a point of the tool, or gripped at an unknown position."""
+    """A known load in a session: hanging on a string from a point of the tool, or gripped at an unknown position."""
 
     __slots__ = ()
 
@@ -33,7 +33,7 @@ class Load(KnownLoad):
 
     @property
     def p_flange_mm(self) -> tuple[float, float, float] | None:
-        """Hook (3,) of the load from the flange face, flange axes, mm; None if the load is gripped."""
+        """Position (3,) of the load's hook from the flange face, flange axes, mm; None if the load is gripped."""
         if self.p_flange_m is None:
             return None
         x, y, z = (round(1e3 * value, 6) for value in self.p_flange_m)
@@ -41,7 +41,7 @@ class Load(KnownLoad):
 
     @property
     def most_swing_N(self) -> float | None:
-        """Force amplitude of a swing by 5 degrees, above which a pose is repeated; None if the load is gripped."""
+        """Force amplitude of a 5-degree swing, above which a pose is repeated; None if the load is gripped."""
         return None if self.gripped else self.mass_kg * STANDARD_GRAVITY_M_S2 * sin(_MOST_SWING_RAD)
 
     def sampling(self, usual: Sampling) -> Sampling:
@@ -66,7 +66,7 @@ class Load(KnownLoad):
 
     @classmethod
     def of(cls, mass: str, place: str | None, *, gripped: bool) -> Self:
-        """Return the load of the options `--load`, `--at` and `--gripped`; raises `ConfigError`."""
+        """Return the load given by the options `--load`, `--at` and `--gripped`; raises `ConfigError`."""
         mass_kg, sigma_kg = mass_of(mass)
         if (place is None) != gripped:
             raise ConfigError("--load needs a position: give its hook, such as --at tip=0,0,200, or --gripped")
@@ -77,7 +77,7 @@ class Load(KnownLoad):
 
     @classmethod
     def of_header(cls, header: Mapping[str, Any]) -> Self | None:
-        """Return the load of run.json or of a dataset's `meta`; None if there is none."""
+        """Return the load recorded in run.json or in a dataset's `meta`; None if there is none."""
         stored = header.get("load")
         if stored is None:
             return None
@@ -99,7 +99,7 @@ class Load(KnownLoad):
 
 
 def mass_of(text: str) -> tuple[float, float]:
-    """Return mass and standard deviation, kg, from a text such as 2.0 or 2.0±0.002; raises `ConfigError`."""
+    """Return the mass and its standard deviation, kg, from a text such as 2.0 or 2.0±0.002; raises `ConfigError`."""
     try:
         mass_kg, *rest = (float(part) for part in re.split(r"±|\+/?-", text))
         sigma_kg = rest[0] if rest else MASS_SHARE * mass_kg
@@ -113,7 +113,7 @@ def mass_of(text: str) -> tuple[float, float]:
 
 
 def place_of(text: str) -> tuple[str, tuple[float, float, float]]:
-    """Return name and position, m, from a text NAME=x,y,z in mm from the flange face; raises `ConfigError`."""
+    """Return the name and the position, m, from a text NAME=x,y,z in mm from the flange face; raises `ConfigError`."""
     name, given, numbers = text.partition("=")
     if not re.fullmatch(r"[\w-]+", name):
         raise ConfigError(f"the place '{text}' has no name: give one such as tip=0,0,200")

@@ -1,4 +1,4 @@
-"""Raw recording of a free tool in motion: every sample of sensor and arm, in one file of a run or in several parts."""
+"""Raw recording of a free tool in motion: all samples from sensor and arm, in one file of a run or in several parts."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -16,7 +16,7 @@ from ftdrive.runs.numbers import DAMAGE, read_arrays, write_arrays
 from ftdrivers.interfaces import ArmStates, FtSamples
 
 FORMAT: Final = "ftdrive.motion/1"
-# Arrays with the shape of one sample; a sensor may have any number of counts.
+# Arrays, each with the shape of one sample; a sensor may have any number of counts.
 _WRENCH: Final = {"t_host_ns": (), "t_device_s": (), "seq": (), "counts": None, "wrench": (6,), "status": ()}
 _POSES: Final = {
     "t_host_ns": (),
@@ -30,7 +30,7 @@ _POSES: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionRecording:
-    """Samples of sensor and arm while the tool moved."""
+    """Samples from the sensor and the arm, taken while the tool moved."""
 
     samples: FtSamples
     states: ArmStates
@@ -38,7 +38,7 @@ class MotionRecording:
     """Nominal rate of the sensor; NaN if the sensor is polled."""
 
     def save(self, path: Path) -> None:
-        """Write a new file; return when it is on disk."""
+        """Write a new file; return once it is on disk."""
         wrench = {f"wrench_{name}": getattr(self.samples, name) for name in _WRENCH}
         poses = {f"pose_{name}": getattr(self.states, name) for name in _POSES}
         arrays = {"format": np.array(FORMAT), "nominal_rate_Hz": np.array(self.nominal_rate_Hz), **wrench, **poses}
@@ -61,7 +61,7 @@ class MotionRecording:
 
     @property
     def count(self) -> Array:
-        """Time of the sensor's clock, s, else its sample number; NaN for a polled sensor, which has neither."""
+        """Times on the sensor's clock, s, or sample numbers; NaN for a polled sensor, which has neither."""
         if np.isfinite(self.samples.t_device_s).all():
             return self.samples.t_device_s
         even = math.isfinite(self.nominal_rate_Hz)
@@ -69,7 +69,7 @@ class MotionRecording:
 
 
 def means_of(path: Path) -> tuple[Means, Means]:
-    """Return wrench and pose means for the estimator, with host times since the first sample, s.
+    """Return means of the wrench and of the pose for the estimator, with host times since the first sample, s.
 
     The files of a recording in parts are read twice, so that only one is in memory at a time. Raises `BadDataset`.
     """

@@ -1,4 +1,4 @@
-"""Files of arrays, and lines of JSON, in a run; each array and each line has a checksum."""
+"""Array files and JSON lines in a run; each array and each line has a checksum."""
 
 import io
 import json
@@ -14,19 +14,19 @@ from typing import Any, Final
 
 from ftcalib.files import MOST_BYTES, parsed_json, read_file, write_new
 
-# Errors of `zipfile` for a damaged file, besides OSError; RuntimeError for a supposed password or compression.
+# Errors that `zipfile` raises for a damaged file, besides OSError; RuntimeError for a supposed password or compression.
 ZIP_DAMAGE: Final = (
     *(EOFError, MemoryError, OverflowError, RuntimeError, ValueError),
     *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
 )
-# Errors for a damaged file of arrays; numpy may raise TokenError.
+# Errors for a damaged array file; numpy may raise TokenError.
 DAMAGE: Final = (*ZIP_DAMAGE, KeyError, OSError, TypeError, tokenize.TokenError)
-# Field of a line with the CRC-32 of the other fields, as JSON with sorted keys.
+# Field of a line with the CRC-32 of the other fields, written as JSON with sorted keys.
 CRC: Final = "crc32"
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool) -> None:
-    """Write a new file of named arrays; return when it is on disk."""
+    """Write a new file of named arrays; return once it is on disk."""
     import numpy as np
 
     buffer = io.BytesIO()
@@ -41,7 +41,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
     with zipfile.ZipFile(io.BytesIO(read_file(path))) as file:
         if (size := sum(member.file_size for member in file.infolist())) > MOST_BYTES:
             raise ValueError(f"its unpacked size is {size / 1e6:.0f} MB, above {MOST_BYTES / 1e6:.0f} MB")
-        # `ZipFile.read` reads to the end of each array, where its CRC-32 is checked; `numpy.load` need not.
+        # `ZipFile.read` reads to the end of each array, where its CRC-32 is checked; `numpy.load` may stop before.
         return {
             name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
             for name in file.namelist()
@@ -49,7 +49,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
 
 
 def parse_line(line: str) -> dict[str, Any] | None:
-    """Return the object of a line; None if the line is damaged."""
+    """Return the object in a line; None if the line is damaged."""
     try:
         content = parsed_json(line)
     except ValueError:
@@ -60,7 +60,7 @@ def parse_line(line: str) -> dict[str, Any] | None:
 
 
 def line_with_crc(content: Mapping[str, Any]) -> str:
-    """Return an object as a line of JSON with its CRC-32, without a newline."""
+    """Return an object as a JSON line with its CRC-32, without a newline."""
     return json.dumps({**content, CRC: _crc32(content)})
 
 
@@ -71,7 +71,7 @@ def append_lines(file: FileIO, begin: int, objects: Sequence[Mapping[str, Any]])
         while content:
             content = content[file.write(content) :]
     except OSError:
-        # An incomplete line would make the next one unreadable.
+        # An incomplete line would make the line after it unreadable.
         file.truncate(begin)
         raise
 

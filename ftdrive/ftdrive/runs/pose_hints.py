@@ -1,4 +1,4 @@
-"""Probable causes of poses that fit badly."""
+"""Probable causes of badly fitting poses."""
 
 from collections.abc import Sequence
 
@@ -10,24 +10,24 @@ from ftcalib.model import Array
 from ftcalib.routine import MOVED_RAD, DriftCheck, PoseRecord, drift_check, is_return, turned_rad
 
 _SIGNIFICANT = 4.0
-# Findings of a change between two poses.
+# Findings that report a change between two poses.
 _CHANGES = {"com_shifted", "load_changed", "bias_stepped", "sensor_turned", "sensor_changed"}
 
 
 def pose_names(records: Sequence[PoseRecord]) -> tuple[str, ...]:
-    """Return names of the rows of a run's dataset: R and the number of the orientation."""
+    """Return names for the rows of a run's dataset: R and the orientation number."""
     return tuple(f"R{number:02d}" for number in numbers_in_dataset(records))
 
 
 def numbers_in_dataset(records: Sequence[PoseRecord]) -> tuple[int, ...]:
-    """Return the number of the orientation of each row of a run's dataset."""
+    """Return the orientation number of each row of a run's dataset."""
     return tuple(record.pose.number for record in _in_dataset(records))
 
 
 def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Finding, ...]:
     """Return findings about outlier poses of a tour, most important first; empty without outliers or records.
 
-    `result` is the result of the dataset of these records, which are in the order of the tour.
+    `result` is the calibration from the dataset of these records, which are in the order of the tour.
     """
     if not records:
         return ()
@@ -75,14 +75,14 @@ def find_moved(records: Sequence[PoseRecord]) -> list[Finding]:
 
 
 def _out_of_line(result: CalibrationResult) -> list[int]:
-    if "residual_sigma" not in result.quality:  # results for a new tool, and updates, have none
+    if "residual_sigma" not in result.quality:  # results for a new tool and updates do not have it
         return []
     spread = np.asarray(result.quality["residual_sigma"], dtype=np.float64)
     return out_of_line(spread, np.ones(len(spread), bool) if result.weights is None else result.weights > 0.5)
 
 
 def _sigma(result: CalibrationResult) -> Array:
-    """Return the noise (6,) of a pose: the measured noise, or the typical residual if that is larger."""
+    """Return the noise (6,) at a pose: the measured noise, or the typical residual if that is larger."""
     typical = 1.4826 * np.median(np.abs(result.residuals), axis=0)
     least = np.zeros(6) if result.measured_sigma is None else result.measured_sigma
     return np.maximum(np.maximum(typical, least), 1e-9)

@@ -55,15 +55,15 @@ LOCK: Final = "lock"
 # Columns of a recording, named as in `FtSamples`.
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 
-# Mode of a session: how the arm moves, or how the motion is recorded.
+# Mode of a session: how the arm moves, or how its motion is recorded.
 Mode = Literal["auto", "step", "manual", "listen", "sweep", "passive"]
-# Modes that record in motion; such a run cannot be resumed.
+# Modes that record while the arm moves; such a run cannot be resumed.
 IN_MOTION: Final = ("sweep", "passive")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """A state of the arm, read from a recording."""
+    """A state of the arm as read from a recording."""
 
     t_host_ns: int
     q_rad: Array
@@ -77,7 +77,7 @@ class Run(Displayed):
     ----------
     folder : str or Path
     clock : Clock
-        Clock of the cell that adds poses; each pose records the offset from its `t_host_ns` to UTC.
+        Clock of the cell from which poses are added; each pose records the offset from its `t_host_ns` to UTC.
 
     Examples
     --------
@@ -93,7 +93,7 @@ class Run(Displayed):
 
     def __init__(self, folder: str | Path, clock: Clock = REAL) -> None:
         self.folder = Path(folder)
-        self._clock_offset_ns = time.time_ns() - clock.now_ns()  # from host times in the files to UTC
+        self._clock_offset_ns = time.time_ns() - clock.now_ns()  # offset from host times in the files to UTC
         self._events_lock = threading.Lock()
         self._held = ExitStack()
 
@@ -169,7 +169,7 @@ class Run(Displayed):
 
     @property
     def motion_path(self) -> Path:
-        """Path of the newest recording in motion: a file, or a folder of parts."""
+        """Path of the newest recording in motion: a file, or a folder with the parts."""
         folder = self.folder / "motion"
         return folder if folder.is_dir() else newest_path(self.folder / "motion.npz")
 
@@ -201,7 +201,7 @@ class Run(Displayed):
 
     @property
     def how_to_go_on(self) -> str:
-        """Instruction for a run without enough data for a result. Raises `BadDataset`."""
+        """Instruction for a run that has too few data for a result. Raises `BadDataset`."""
         if self.mode in IN_MOTION:
             return f"start again with --{self.mode}, because a recording in motion cannot be resumed"
         return f"continue it with {self.resume_command}"
@@ -219,11 +219,11 @@ class Run(Displayed):
         return f"ftdrive solve {shlex.quote(str(self.folder))}{with_it}"
 
     def new_path(self, name: str, ending: str = ".json") -> Path:
-        """Return the next free path of a name: name.json, name-2.json and so on."""
+        """Return the next unused path for a name: name.json, name-2.json and so on."""
         return unused_path(self.folder / f"{name}{ending}")
 
     def append_event(self, event: Mapping[str, Any], *, sync: bool = False) -> None:
-        """Append a line to events.ndjson; with `sync` return when it is on disk. Any thread may call this method."""
+        """Append a line to events.ndjson; with `sync`, return once it is on disk. Any thread may call this method."""
         with self._events_lock, self._events_path.open("ab", buffering=0) as file:
             append_lines(file, file.tell(), [event])
             if sync:
@@ -238,7 +238,7 @@ class Run(Displayed):
             if (event := parse_line(line)) is None:
                 raise BadDataset(f"{path}: line {number} is damaged: {_RESTORE}")
             yield event
-        # The rest is an event if only its newline is missing or damaged.
+        # The remainder is an event if only its newline is missing or damaged.
         if (event := parse_line(rest) or parse_line(rest[:-1])) is not None:
             yield event
 
@@ -252,7 +252,7 @@ class Run(Displayed):
             os.truncate(self._events_path, read_file(self._events_path).rfind(b"\n") + 1)
 
     def temperature_C(self) -> float | None:
-        """Return the mean temperature of the sensor over the poses, °C; None if it reported none."""
+        """Return the sensor's mean temperature over the poses, °C; None if it reported none."""
         by_stop = {
             event.get("stop"): event.get("temperature_C") for event in self.events() if event.get("event") == POSE
         }
@@ -275,10 +275,10 @@ class Run(Displayed):
         return _Whole(path, header)
 
     def header_to_resume(self) -> Mapping[str, Any]:
-        """Return the contents of run.json; raises `BadDataset` also if the plan of the run is missing."""
+        """Return the contents of run.json; also raises `BadDataset` if the plan of the run is missing."""
         header = self.header()
         for section, key in (("robot", "host"), ("sensor", "url")):
-            header["config"][section][key]  # a missing entry raises here
+            header["config"][section][key]  # a missing entry raises an error here
         if self.mode in ("auto", "step") and not self.plan_path.is_file():
             raise BadDataset(
                 f"{self.plan_path} is missing, and without its plan the run cannot be resumed: {_RESTORE}, or solve "
@@ -287,7 +287,7 @@ class Run(Displayed):
         return header
 
     def commit(self, record: PoseRecord) -> PoseRecord:
-        """Write a pose; return it, as `records` reads it, when it is on disk."""
+        """Write a pose; once it is on disk, return it as `records` would read it."""
         record = replace(record, clock_offset_ns=record.clock_offset_ns or self._clock_offset_ns)
         readings: dict[str, Any] = {
             f"{when}_{name}": np.asarray(getattr(reading, name))
@@ -309,11 +309,11 @@ class Run(Displayed):
         return record
 
     def records(self) -> list[PoseRecord]:
-        """Return every pose in the order of the tour; of a pose taken again, only the newest."""
+        """Return every pose in the order of the tour; only the newest version of a pose taken again."""
         return [_read_pose_record(newest_path(self.folder / "poses" / f"{stop:02d}.npz")) for stop in self.stops()]
 
     def stops(self) -> list[int]:
-        """Return the stops with a pose, without reading the poses."""
+        """Return the stops that have a pose, without reading the poses."""
         names = {path.stem.partition("-")[0] for path in (self.folder / "poses").glob("*.npz")}
         return sorted(int(name) for name in names if name.isdecimal())
 

@@ -1,4 +1,4 @@
-"""Reading and solving of the data sources that commands accept: run folders, datasets and tables."""
+"""Reads and solves the data sources that commands accept: run folders, datasets and tables."""
 
 import hashlib
 import tomllib
@@ -73,7 +73,7 @@ _UNDESCRIBED: Final = Setup()
 
 @dataclass(frozen=True, slots=True)
 class SolveOptions:
-    """Options of `ftdrive solve` and `ftdrive report`: facts about the data, and the method of solution."""
+    """Options of `ftdrive solve` and `ftdrive report`: facts about the data, and the solution method."""
 
     method: str = "ml"
     """A `ftcalib.result.Method`, or "all" to compare the methods."""
@@ -83,7 +83,7 @@ class SolveOptions:
     known: Known | None = None
     """Known values. A known direction of gravity means that the base is level with respect to its mounting."""
     up_in_base: Sequence[float] | None = None
-    """(3,) declared up direction in base, which replaces the direction of the mounting in a run."""
+    """(3,) declared up direction in base axes, which replaces the direction given by the mounting of a run."""
     as_published: bool = False
     earlier: CalibrationResult | None = None
     """Earlier result, from which a new tool takes mounting, gravity direction and gain."""
@@ -93,7 +93,7 @@ class SolveOptions:
     topics: tuple[str | None, str | None] = (None, None)
     """Topics of a ROS bag: wrench and pose."""
     table: TableOptions | None = None
-    """Facts about a table of another program; None if there are none."""
+    """Facts about another program's table; None if there are none."""
     words: tuple[str, ...] = ()
     """These options as typed, quoted for a shell."""
 
@@ -163,7 +163,7 @@ class SolveOptions:
 
 
 def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: str | None) -> Known | None:
-    """Return the known values of the options in degrees; None if there are none. Raises `ConfigError`."""
+    """Return the values that the options declare known; None if there are none. Raises `ConfigError`."""
     if mass_kg is None and level_deg is None and mounting_deg is None:
         return None
     R_flange_sensor = None
@@ -182,7 +182,7 @@ def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: s
 
 
 def up_direction(up: str | None) -> list[float] | None:
-    """Return the direction (3,) of `--up`; None without it. Raises `ConfigError`."""
+    """Return the direction (3,) given by `--up`; None without it. Raises `ConfigError`."""
     if up is None:
         return None
     direction = parse_numbers("--up", up, ",", (3,))
@@ -204,7 +204,7 @@ def table_options(
     model: str | None,
     urdf: str | None,
 ) -> TableOptions:
-    """Return the options of a command that describe a table. Raises `ConfigError` or `OSError`."""
+    """Return those options of a command that describe a table. Raises `ConfigError` or `OSError`."""
     offset = [0.0] * 6 if tcp is None else parse_numbers("--tcp", tcp, ",", (3, 6))
     turn = [*offset, 0.0, 0.0, 0.0][3:6]
     named, text = ({}, {}) if columns is None else _named_columns(columns)
@@ -223,7 +223,7 @@ def table_options(
 
 
 def _named_columns(text: str) -> tuple[Mapping[str, str], Mapping[str, Any]]:
-    """Return the columns by signal from an option or a TOML file, and the section `text` of the file."""
+    """Return the columns by signal from an option or a TOML file, and the `text` section of the file."""
     if text.endswith(".toml"):
         try:
             document = tomllib.loads(read_file(text).decode())
@@ -300,7 +300,7 @@ class RecordedData:
         as_published: bool = False,
         earlier: CalibrationResult | None = None,
     ) -> CalibrationResult:
-        """Return the calibration; with an earlier result, given or recorded in the run, only of a new tool."""
+        """Return the calibration; with an earlier result, given or recorded in the run, solve only for a new tool."""
         earlier = earlier or self.earlier
         if earlier is not None:
             require_same_cell(earlier, self.provenance)
@@ -323,7 +323,7 @@ class RecordedData:
 
     @property
     def truth(self) -> Parameters | None:
-        """True parameters, if the run is of an emulated cell."""
+        """True parameters if the run is from an emulated cell, else None."""
         truth = (self.provenance.get("station") or {}).get("truth")
         return None if truth is None else Parameters(*(np.array(truth[item.name]) for item in fields(Parameters)))
 
@@ -345,7 +345,7 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
         data = RecordedData(dataset, {"source": source.name, **recognised, "versions": versions()})
         if table.has_nominal_kinematics:
             data = replace(data, setup=replace(data.setup, orientation_accuracy_deg=NOMINAL_ORIENTATION_DEG))
-        if table.gravity_is_measured:  # its direction defines the base
+        if table.gravity_is_measured:  # the direction of gravity defines the base
             known = replace(known or Known(), gravity_direction_base=-UP_IN_BASE)
     if options.table is not None and (source.is_dir() or source.suffix == ".json"):
         raise ConfigError(f"{source.name} is not a table: leave out options for tables, such as --columns")
@@ -365,7 +365,7 @@ def as_source(source: Any) -> Any:
     """Return a dataset, a recording, or a Path, DataFrame or mapping that may be either, from a user's argument.
 
     A pair has R_base_flange (n, 3, 3), or n Rotations, and the wrenches (n, 6), N and N·m. Raises `BadDataset` for
-    arrays of other shapes, and `TypeError`, whose message names the right call, for other arguments.
+    arrays of other shapes, and for other arguments `TypeError`, whose message names the right call.
     """
     if isinstance(source, str):
         return Path(source)
@@ -427,9 +427,9 @@ def read_dataset(
 
 
 def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` if an earlier result cannot be used for a new tool: it is rejected or of a different cell.
+    """Raise `ConfigError` if an earlier result cannot be used for a new tool: it is rejected or from a different cell.
 
-    Sensor, arm and mount are compared as far as both sides name them.
+    Sensor, arm and mount are compared if both sides name them.
     """
     if earlier.verdict == "rejected":
         raise ConfigError(f"--from: result {earlier.id} is rejected: give an accepted one")
@@ -447,7 +447,7 @@ def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Circumstances:
-    """Facts about the data of a run, from its header and events."""
+    """Facts about the data of a run, taken from its header and events."""
 
     g_m_s2: float
     setup: Setup
@@ -456,7 +456,7 @@ class Circumstances:
     """Devices, run, cell and temperature."""
 
     def provenance(self) -> dict[str, Any]:
-        """Return the provenance of a result that is made at this time."""
+        """Return the provenance for a result that is made now."""
         return {**made_now(), **self.origin}
 
 
@@ -492,7 +492,7 @@ def solve_and_save(run: Run) -> Outcome:
 def solve_in_motion(
     run: Run, known: Known | None = None, *, earlier: CalibrationResult | None = None, point_mass: bool = False
 ) -> CalibrationResult:
-    """Return the solution of a run in motion; for a new tool with the given or the recorded earlier result."""
+    """Solve a run in motion; with an earlier result, given or recorded in the run, solve only for a new tool."""
     circumstances, earlier = circumstances_of(run), earlier or _earlier_of(run)
     if earlier is not None:
         require_same_cell(earlier, circumstances.origin)
@@ -516,13 +516,13 @@ def solve_in_motion(
 
 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
-    """Return the outcome of a run from its records, or from those of a replay."""
+    """Return the outcome of a run for its records, or for those of a replay."""
     data = _recorded_data(run, records)
     return Outcome(run, data.dataset, data.solve(run.method), drift_check(records))
 
 
 def _earlier_of(run: Run) -> CalibrationResult | None:
-    """Return the result with mounting, base and gain for a run of a new tool; None for any other run."""
+    """Return the result that gives mounting, base and gain to a new tool's run; None for any other run."""
     document = run.header().get("earlier")
     return None if document is None else CalibrationResult.from_dict(document)
 
@@ -541,7 +541,7 @@ def _recorded_data(run: Run, records: Sequence[PoseRecord]) -> RecordedData:
 
 
 def circumstances_of(run: Run) -> Circumstances:
-    """Return the facts that `solve` needs besides the data of a run; the data are not read.
+    """Return the facts that `solve` needs in addition to the data of a run; the data are not read.
 
     A tool with a load gets another name, so that its result is not used for the tool alone.
     """
@@ -555,10 +555,10 @@ def circumstances_of(run: Run) -> Circumstances:
     tool_kg, mounting, height_mm = tool.get("mass_kg"), workcell.get("mounting"), sensor.get("height_mm")
     tool_kg = tool_kg + load.mass_kg if load and tool_kg else tool_kg
     tool_sigma_kg = None if load else tool.get("mass_sigma_kg")
-    # With a load, the centre of mass may be outside the cylinders of the tool.
+    # With a load, the centre of mass may lie outside the tool's cylinders.
     cylinders_mm = [list(row) for row in tool.get("cylinders_mm", ())] if workcell.get("measured") and not load else []
     ranges = [sensor["range_N"], sensor["range_Nm"]] if sensor.get("range_N") and sensor.get("range_Nm") else None
-    # Facts to which a result is bound, or with which it is compared.
+    # Facts to which a result is bound, or against which it is compared.
     described = {
         "payload_kg": payload_kg,
         "p_flange_payload_m": p_flange_payload_m,

@@ -3,7 +3,7 @@
 verification.json   ftdrive.verification/1, in the run folder of the poses: calibration, limits, poses, outcome
 calibration.json    in the same folder, if the operator accepted an update; its provenance names the parent
 
-A verification belongs to a calibration by the id, regardless of paths. `verification_near` searches the run folders
+The id links a verification to its calibration, regardless of paths. `verification_near` searches the run folders
 next to that of the calibration, those in `runs` next to the calibration file, and those in `runs` of the current
 folder.
 """
@@ -22,7 +22,7 @@ from ftcalib.errors import BadCalibration, BadDataset, NotObservable
 from ftcalib.files import JSON, check_format, object_of, read_file, write_object
 from ftdrive.runs.calibration import at, made_now, marks_of, number_at, numbers_at, text_at, time_at
 
-# A list of results must not import numpy.
+# Listing results must not import numpy.
 if TYPE_CHECKING:
     from ftcalib import CalibrationDataset, CalibrationResult
     from ftcalib.after.state import Update
@@ -44,7 +44,7 @@ _COPIED: Final = ("devices", "station", "setup", "edited")
 
 
 class VerificationRecord(NamedTuple):
-    """Outcome of a verification of a calibration; a tuple, because a fleet reads 20,000 of them per minute."""
+    """Outcome of a calibration's verification; a tuple, because a fleet reads 20,000 of them per minute."""
 
     path: str
     """Path of verification.json in its run folder."""
@@ -109,7 +109,7 @@ class VerificationRecord(NamedTuple):
         return {name: values[name] for name in names or self._fields[:_RECORDED]}
 
     def in_words(self, now: datetime | None) -> str:
-        """Describe outcome and age, such as "verified 2 h ago"; the age is 0 if `now` is None."""
+        """Describe the outcome and its age, such as "verified 2 h ago"; the age is taken as 0 if `now` is None."""
         made = self.created_utc
         age = timedelta(0) if now is None or made is None else now - datetime.fromisoformat(made)
         if self.passed:
@@ -119,7 +119,7 @@ class VerificationRecord(NamedTuple):
 
 def verification_near(place: Path, calibration_id: str) -> VerificationRecord | None:
     """Return the newest verification of a calibration, given its file or run folder; None if there is none."""
-    # By id, because the calibration's own run folder is complete and gets no more files.
+    # Searched by id, because the calibration's own run folder is complete and gets no more files.
     folder, records = place.absolute() if place.is_dir() else place.absolute().parent, list[VerificationRecord]()
     for parent in dict.fromkeys((folder.parent, folder / "runs", Path("runs").absolute())):
         for file in sorted(parent.glob("*/verification*.json")):
@@ -145,7 +145,7 @@ def fitted_dataset(calibration: "CalibrationResult", place: Path) -> "Calibratio
 
 
 def age_in_words(age: timedelta) -> str:
-    """Describe an age in minutes, hours or days."""
+    """Return an age as text, in minutes, hours or days."""
     hours = max(0.0, age.total_seconds()) / 3600
     return f"{hours * 60:.0f} min" if hours < 1 else f"{hours:.0f} h" if hours < 48 else f"{hours / 24:.0f} d"
 
@@ -190,7 +190,7 @@ class Verified:
 
     @property
     def passed(self) -> bool:
-        """Whether the calibration is still valid, by the given limits or else by the statistical test."""
+        """Whether the calibration is still valid, according to the given limits or else to the statistical test."""
         return bool(self.verification.passed) if self.limits == NO_LIMITS else not self.exceeded
 
     @property

@@ -1,4 +1,4 @@
-"""Weighings of a tool: one file per day (UTC), to which every weighing program appends lines.
+"""Weighings with a tool: one file per day (UTC), to which every weighing program appends lines.
 
     {"format": "ftdrive.weighings/1", "day": "2026-11-26", "tool": "gripper", …, "crc32": "…"}
     {"t_utc": "2026-11-26T10:15:00+00:00", "mass_kg": 0.2503, "mass_sigma_kg": 0.0004, …, "crc32": "…"}
@@ -27,14 +27,14 @@ FILES: Final = "weighings-*.ndjson"
 # change must increase `ftdrive.store.database.SCHEMA`.
 REFUSALS: Final = (
     *("samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "undecided", "count"),
-    "other",  # stands for every code of a newer version
+    "other",  # stands for every code from a newer version
 )
-# Number of bytes at the end of a file that contain a complete line end, even after a power failure.
+# Number of bytes at the end of a file that always include a line end, even after a power failure.
 _TAIL: Final = 1 << 16
 
 
 def append_weighings(folder: Path, origin: Mapping[str, JSON], day: str, lines: Sequence[Mapping[str, JSON]]) -> Path:
-    """Append lines to the file of a day (ISO 8601), and return its path when they are on disk.
+    """Append lines to the file of a day (ISO 8601), and return its path once they are on disk.
 
     `origin` has the other fields of the header. Other programs may append lines at the same time. Raises `OSError`; the
     file is then unchanged.
@@ -63,7 +63,7 @@ def append_weighings(folder: Path, origin: Mapping[str, JSON], day: str, lines: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeighingDay:
-    """The weighings of one day (UTC) with one calibration on one arm: one file, or the sum of several files."""
+    """The weighings on one day (UTC) with one calibration on one arm: one file, or the sum of several files."""
 
     id: str
     """Name of the file without its extension."""
@@ -77,7 +77,7 @@ class WeighingDay:
     calibration_id: str | None = None
     emulated: bool = False
     size: int = 0
-    """Number of bytes that were read; further bytes of the file are new."""
+    """Number of bytes read so far; further bytes in the file are new."""
     weighings: int = 0
     """Number of weighed parts; weighings of an empty gripper do not count."""
     refusals: Mapping[str, int]
@@ -128,7 +128,7 @@ class WeighingDay:
 
 
 def sum_up(days: Iterable[WeighingDay]) -> list[WeighingDay]:
-    """Return the sum of the last day of each tool and arm, with its last weighing, the oldest first."""
+    """Return the totals of the last day of each tool and arm, with its last weighing, the oldest first."""
     last = dict[tuple[object, ...], WeighingDay]()
     for part in sorted(days, key=lambda part: (part.day, part.last_utc or "", part.id)):
         key = (part.tool, part.arm_serial, part.robot_host, part.emulated)

@@ -1,4 +1,4 @@
-"""Recognition of the signals in the columns of a table, and of their units."""
+"""Recognition of the signals in the columns of a table, and of the units."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +12,7 @@ from ftcalib.judge.units import FORCE_UNITS_N, TORQUE_UNITS_NM
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 
 _DEG = 0.017453292519943295
-# Factors to SI units by quantity; the names of units are without spaces, dots, `·`, `*`, `-` and `^`.
+# Factors to SI units by quantity; the names of the units have no spaces, dots, `·`, `*`, `-` or `^`.
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "time": {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
     "force": {**FORCE_UNITS_N, "kg": FORCE_UNITS_N["kgf"], "lb": FORCE_UNITS_N["lbf"]},
@@ -29,7 +29,7 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
 }
 COUNTS: Final = ("counts", "count", "cts", "digits")
 _BEHIND = re.compile(r"(?P<name>.+?)(?:\s*[\[(](?P<bracket>[^\])]*)[\])]|_(?P<suffix>[^\W_]+))\s*")
-# Longest name that is searched for a unit, because the search time grows with the square of the length.
+# Longest column name that is searched for a unit, because the search time grows with the square of the length.
 _LONGEST_NAME = 200
 _SUFFIXES: Final = frozenset(
     {*UNITS["time"], *UNITS["torque"], *COUNTS, "N", "mN", "kgf", "lbf", "mm", "cm", "m", "deg", "rad"}
@@ -37,14 +37,14 @@ _SUFFIXES: Final = frozenset(
 
 
 class Layout(NamedTuple):
-    """Names of the columns in one program."""
+    """Names that one program gives to the columns."""
 
     program: str
     signals: Mapping[str, str]
     """Alternative lists of column names by signal, separated by `|`; the first complete list is used.
 
-    Names are in lower case, with `_` for all other characters than letters and digits. `?` means x, y, z; `#` means 0
-    to 5; `*` is any prefix that is the same in all names of a list.
+    Names are in lower case, with `_` for every character that is not a letter or a digit. `?` means x, y, z; `#` means
+    0 to 5; `*` is any prefix that is the same in all names of a list.
     """
 
 
@@ -157,7 +157,7 @@ class SignalColumns:
     names, units : sequence of str
         Names and units of the header; if a unit is empty, it may be part of the name.
     given : mapping, optional
-        Columns of the file by the names of ftdrive: ``{"fx": "Force X [N]", "t": "1"}``.
+        Columns of the file, by their names in ftdrive: ``{"fx": "Force X [N]", "t": "1"}``.
     in_memory : bool
         Whether the table is in memory; messages then show Python code instead of a command option.
 
@@ -193,7 +193,7 @@ class SignalColumns:
         self._layouts = [layout for *_, layout in sorted(ranked, reverse=True, key=lambda one: one[:2])]
 
     def find(self, *signals: str) -> Signal | None:
-        """Return the first available one of some signals; None without any. Raises `BadDataset` for two candidates."""
+        """Return the first of some signals that the table has, else None. Raises `BadDataset` for two candidates."""
         two, line = list[str](), ""
         for layout, signal in product(self._layouts, signals):
             for way in layout.signals.get(signal, "").split("|"):
@@ -204,7 +204,7 @@ class SignalColumns:
                 if candidates and not two:
                     two = [self.names[one[0][0]] for one in candidates]
                     line = self.line(signal)
-        if two and signals != ("time",):  # two topics have time stamps besides the clock of the file
+        if two and signals != ("time",):  # two topics have time stamps besides the file's own clock
             raise BadDataset(f"two candidates, {' and '.join(two[:2])}. Name the columns: {line}")
         return None
 
@@ -213,7 +213,7 @@ class SignalColumns:
         return any(self._nearest(layout, signal)[0] for layout in LAYOUTS if signal in layout.signals)
 
     def missing(self, what: str, *signals: str) -> str:
-        """Return an error message about a missing signal: existing columns, nearest layout, and the line to type."""
+        """Return a message about a missing signal: existing columns, the nearest layout, and the line to type."""
         near = (self._nearest(layout, one) for layout in LAYOUTS for one in signals if one in layout.signals)
         share, program, missing, signal = max(near, key=lambda one: one[0])
         nearest = f" The layout of {program} lacks {', '.join(missing)}." if share else ""
@@ -223,7 +223,7 @@ class SignalColumns:
         return f"no {what} among the columns {named}.{nearest} Name the columns: {self.line(signal)}"
 
     def line(self, signal: str) -> str:
-        """Return the option or argument that names the columns of a signal, with the recognised ones filled in."""
+        """Return the option or argument that names the columns of a signal, with the recognised columns filled in."""
         parts = {}
         for key in OWN_NAMES[signal].split():
             found = self._keys.get(key) or self._keys.get(_OTHER_NAMES.get(key, key))
@@ -235,7 +235,7 @@ class SignalColumns:
         return f'--columns "{",".join(f"{key}={name}" for key, name in parts.items())}"'
 
     def _find(self, key: str, column: str) -> tuple[int, str]:
-        """Return index and unit of a column that was given by name or number."""
+        """Return the index and the unit of a column given by name or number."""
         column, unit = column.strip(), ""
         if column not in self.names and (match := re.fullmatch(r"(.+?)\s*\[([^\]]*)\]", column)):
             column, unit = match[1], match[2]
@@ -269,7 +269,7 @@ class SignalColumns:
         return complete
 
     def _of_one_case(self, columns: Sequence[list[tuple[int, str]]]) -> list[list[tuple[int, str]]]:
-        """Return the columns without those in another letter case: with O and A, T is an angle and t is a time."""
+        """Return the columns without those in the other letter case: next to O and A, T is an angle and t is a time."""
         upper = [self.names[one[0][0]].isupper() for one in columns if len(one) == 1] or [False]
         chosen = [[each for each in one if self.names[each[0]].isupper() == all(upper)] for one in columns]
         return [one if len(every) > 1 and one else list(every) for one, every in zip(chosen, columns, strict=True)]
@@ -296,7 +296,7 @@ class SignalColumns:
         return nearest
 
 
-# Names of the columns of each signal in `--columns`.
+# Names of the columns of each signal, as in `--columns`.
 OWN_NAMES: Final = {
     "time": "t",
     "wrench": "fx fy fz tx ty tz",
@@ -323,12 +323,12 @@ _OTHER_NAMES: Final = {"tx": "mx", "ty": "my", "tz": "mz", "t": "time"}
 
 
 def _normalized(name: str) -> str:
-    """Return a name in lower case, with `_` for all other characters than letters and digits."""
+    """Return a name in lower case, with `_` for every character that is not a letter or a digit."""
     return re.sub(r"[\W_]+", "_", name.lower()).strip("_")
 
 
 def factor(unit: str, kind: str, column: str) -> float | None:
-    """Return the factor of a unit to SI; None without a unit. Raises `BadDataset` for a unit of another quantity.
+    """Return the factor from a unit to SI; None without a unit. Raises `BadDataset` for a unit of another quantity.
 
     The unit may have a numerical factor: `.82 N` corrects the scale of a sensor that was checked with a known mass.
     """
@@ -350,7 +350,7 @@ def factor(unit: str, kind: str, column: str) -> float | None:
 
 
 def _keys_of(name: str) -> Iterator[tuple[str, str]]:
-    """Yield the possible keys of a name, each with the unit in the name, such as `fx [N]`, `t_ms`, `x (mm)`."""
+    """Yield the possible keys of a name, each with the unit in the name, as for `fx [N]`, `t_ms`, `x (mm)`."""
     match = _BEHIND.fullmatch(name) if len(name) <= _LONGEST_NAME else None
     if match and match["bracket"] is not None and re.search(r"[^\W\d]|°|^$", match["bracket"]):
         yield _normalized(match["name"]), match["bracket"].strip()

@@ -23,9 +23,9 @@ from ftdrive.tables.columns import COUNTS, UNITS, Signal, SignalColumns, factor
 from ftdrive.tables.text import TextTable, seconds_of
 
 WrenchAxes = Literal["sensor", "flange", "tcp", "base"]
-# Axis sequences as in scipy: upper case for rotations about tool axes, lower case about base axes.
+# Axis sequences as in SciPy: upper case for rotations about tool axes, lower case about base axes.
 _MAKERS: Final = {"rpy": "xyz", "abc": "ZYX", "wpr": "xyz", "oat": "ZYZ"}
-# Rotation axis of each column.
+# Rotation axis of each angle column.
 _AXES: Final = {"rpy": "xyz", "abc": "zyx", "wpr": "xyz", "oat": "zyz", "vector": "xyz", "angles": "xyz"}
 _ORIENTATIONS: Final = (
     *("matrix", "quaternion", "quaternion_w_first", "transform", "tcp_pose", "vector", "rpy", "abc", "wpr", "oat"),
@@ -40,34 +40,34 @@ _KIND: Final = {
     **dict.fromkeys((*_AXES, "joints"), "angle"),
 }
 _LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
-# Largest deviation from length 1 of a quaternion with two decimals.
+# Largest deviation from unit length of a quaternion that is rounded to two decimals.
 _ROUNDED_LENGTH = 0.01
-# Beyond two turns, or beyond the reach of any arm, the units must be degrees and mm.
+# Angles beyond two turns must be in degrees, and positions beyond the reach of any arm in mm.
 _MOST_RAD, _MOST_M = 4 * np.pi, 10.0
 _UNITS_OF_TIME: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 # Range of Unix times, from 1990 to 2100.
 _EPOCH_S: Final = (6.3e8, 4.1e9)
-# Range of the time steps of a recording, 50 kHz to 5 Hz, and its smallest number of rows.
+# Range of the time steps in a recording, 50 kHz to 5 Hz, and the smallest number of its rows.
 _STEPS_S: Final = (2e-5, 0.2)
 _RECORDING_ROWS = 200
-# Range of the time from pose to pose, s; other values are in another unit.
+# Range of the time from pose to pose, s; values outside it are in another unit.
 _POSE_STEPS_S: Final = (0.5, 1e3)
 # Largest rotation between rows at rest, due to encoder noise and rounding.
 _AT_REST_RAD: Final = float(np.radians(0.2))
-# Rows at rest become poses if they are at least this share of the table; the others are motion between poses.
+# Rows at rest become poses if they are at least this share of the table; the other rows are moves between poses.
 _MOSTLY: Final = 0.9
-# Below this distance from upside down, any horizontal axis may turn a vector upright.
+# For a vector closer than this to upside down, any horizontal axis will do to turn it upright.
 _UPSIDE_DOWN = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableOptions:
-    """Facts that a table itself lacks.
+    """Facts about a table that the table itself lacks.
 
     Raises
     ------
     ConfigError
-        The order of angles, the text format or the rate is invalid.
+        The order of the angles, the text format or the rate is invalid.
 
     Examples
     --------
@@ -78,7 +78,7 @@ class TableOptions:
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Columns of the table by the names of ftdrive, if needed with a unit: ``{"fx": "Force X [kgf]"}``."""
+    """Columns of the table by their names in ftdrive, with a unit if needed: ``{"fx": "Force X [kgf]"}``."""
     separator: Literal["", ",", ";", "\t", " "] = ""
     """Separator of the text; recognised if empty."""
     decimal: Literal["", ".", ","] = ""
@@ -86,7 +86,7 @@ class TableOptions:
     rate_Hz: float | None = None
     """Sample rate of a table without times."""
     euler: str = ""
-    """Order of three angles: rpy, ABC, WPR, OAT, or three axes, such as ZYX (tool axes) or xyz (base axes)."""
+    """Order of the three angles: rpy, ABC, WPR, OAT, or three axes, such as ZYX (tool axes) or xyz (base axes)."""
     wrench_axes: WrenchAxes | None = None
     """Axes and reference point of the wrench; None means the convention of the program, usually the sensor."""
     R_flange_tcp: Array = field(default_factory=lambda: np.eye(3))
@@ -96,7 +96,7 @@ class TableOptions:
     sign: Literal[1, -1] = 1
     """Sign of the wrench: -1 for a sensor that reports the reaction."""
     forward: Callable[[Array], tuple[Array, Array]] | None = None
-    """Forward kinematics: returns R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) of joint angles (n, 6), rad."""
+    """Forward kinematics: returns R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) for joint angles (n, 6), rad."""
 
     def __post_init__(self) -> None:
         if self.euler and self.euler.lower() not in _MAKERS and not re.fullmatch("[xyz]{3}|[XYZ]{3}", self.euler):
@@ -116,7 +116,7 @@ _ANGLES_ONLY = "the order of the three angles is unknown: add --euler, such as Z
 
 
 class _ColumnSource(Protocol):
-    """Source of columns that are read in blocks."""
+    """A source of columns, which are read in blocks."""
 
     names: Sequence[str]
     units: Sequence[str]
@@ -125,11 +125,11 @@ class _ColumnSource(Protocol):
     """Number of commented lines between the rows, which `blocks` has skipped."""
 
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
-        """Yield columns (n, k) of consecutive rows, with the share of the source that is read."""
+        """Yield the columns (n, k) of consecutive rows, with the share of the source read so far."""
 
 
 class _FrameSource:
-    """Columns of a DataFrame of pandas or Polars, a table of pyarrow, or a mapping of names to arrays."""
+    """Columns of a pandas or Polars DataFrame, a pyarrow table, or a mapping of names to arrays."""
 
     words, comments = "", 0
 
@@ -152,14 +152,14 @@ class _FrameSource:
 
 
 class SignalRows(NamedTuple):
-    """Consecutive rows of a signal."""
+    """Consecutive rows of one signal."""
 
     t_s: Array
     """(n,) times."""
     values: Array
     """(n, k) values in SI units."""
     place: float
-    """Share of the source that is read."""
+    """Share of the source read so far."""
 
 
 class Table:
@@ -175,7 +175,7 @@ class Table:
     Raises
     ------
     BadDataset
-        The source is not a table, or a column contradicts its name. A missing signal raises only when it is needed.
+        The source is not a table, or a column contradicts its name. A missing signal is an error only if needed.
     OSError
         The source cannot be read.
     """
@@ -196,7 +196,7 @@ class Table:
             self._find()
 
     def _find(self) -> None:
-        """Recognise the signals, and the factors of their units from names and first rows."""
+        """Recognise the signals, and find the factors of their units from names and first rows."""
         find, options = self._columns.find, self.options
         orientation = find(*(_AXES if options.euler else _ORIENTATIONS))
         self._found = {
@@ -217,7 +217,7 @@ class Table:
 
     @property
     def words(self) -> str:
-        """Description of the recognised format in one line; empty for the names and units of ftdrive."""
+        """Description of the recognised format in one line; empty if names and units are those of ftdrive."""
         programs = {signal.program for signal in self._found.values() if signal} - {"ftdrive", "own program"}
         named = [f"columns of {program}" for program in sorted(programs)]
         if self.options.rate_Hz:  # nothing else reveals a wrong rate
@@ -226,7 +226,7 @@ class Table:
 
     @property
     def has_nominal_kinematics(self) -> bool:
-        """Whether the orientations are computed from joint angles with nominal kinematics."""
+        """Whether the orientations are computed from joint angles by nominal kinematics."""
         orientation = self._found["orientation"]
         return orientation is not None and orientation.form == "joints"
 
@@ -278,7 +278,7 @@ class Table:
             yield SignalRows(t_s, wrench, place)
 
     def poses(self) -> Iterator[SignalRows]:
-        """Yield R_base_flange, row-major, and p_base_flange_m if it is known: (n, 9 or 12). Raises as `wrenches`."""
+        """Yield R_base_flange, row-major, and p_base_flange_m if known: (n, 9 or 12). Raises like `wrenches`."""
         signals = [self._require("orientation"), *([one] if (one := self._found["position"]) else [])]
         if self.gravity_is_measured:
             raise BadDataset(f"{self.name}: gravity does not determine the rotation about it: give the orientation too")
@@ -289,7 +289,7 @@ class Table:
             yield SignalRows(t_s, np.hstack([R.reshape(-1, 9), *([] if p is None else [p])]), place)
 
     def dataset(self, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
-        """Return the table as poses at rest: one per row, or in a long table one per dwell. Raises `BadDataset`."""
+        """Return the table as poses at rest: one per row, or one per dwell in a long table. Raises `BadDataset`."""
         if orientation not in get_args(Orientation):
             raise ValueError(f"orientation is '{orientation}', expected one of {', '.join(get_args(Orientation))}")
         if self._found["sigma"] is None and self._columns.begins("sigma"):
@@ -330,7 +330,7 @@ class Table:
         return rows if sigma or len(rows) < _RECORDING_ROWS else self._of_dwells(rows)
 
     def _of_dwells(self, rows: CalibrationDataset) -> CalibrationDataset:
-        """Return one pose per dwell; the rows unchanged if less than 90 % of them are at rest."""
+        """Return one pose per dwell, or the rows unchanged if less than 90 % of them are at rest."""
         dwells = _dwells(rows.R_base_flange, rows.wrench)
         n_samples = np.array([len(range(*dwell.indices(len(rows)))) for dwell in dwells], np.int64)
         if n_samples.sum() < _MOSTLY * len(rows):
@@ -349,7 +349,7 @@ class Table:
         )
 
     def _form(self, form: str) -> dict[str, JSON]:
-        """Return the form of the orientations, which limits the possible mistakes in them."""
+        """Return the form of the orientations, from which follows what mistakes in them are possible."""
         if form in _AXES and (self.options.euler or form in _MAKERS):
             euler = self.options.euler or form
             return {"form": "euler", "euler": _MAKERS.get(euler.lower(), euler)}
@@ -364,7 +364,7 @@ class Table:
             raise BadDataset(f"{self.name}: {words}, or add {rate} if the samples are evenly spaced")
 
     def _require(self, signal: str) -> Signal:
-        """Return a signal. Raises `BadDataset`, whose message has the line to type, if it is missing."""
+        """Return a signal. If it is missing, raises `BadDataset` with the line to type in its message."""
         if (columns := self._found[signal]) is not None:
             return columns
         with self._named():
@@ -381,7 +381,7 @@ class Table:
             raise BadDataset(f"{self.name}: {error}") from error
 
     def _factors_of(self, signal: Signal, first: Array) -> Array:
-        """Return the factor of each column to SI units; a missing unit is guessed if the numbers are clear."""
+        """Return the factor from each column to SI units; a missing unit is inferred if the numbers leave no doubt."""
         names = [self.source.names[column] for column in signal.columns]
         kinds = {"tcp_pose": ["length"] * 3 + ["angle"] * 3}.get(signal.form, [_KIND.get(signal.form, "")] * len(names))
         if "wrench" in signal.form or signal.form == "sigma":
@@ -420,9 +420,9 @@ class Table:
                 yield t_s, values, place
 
     def _rows(self, signals: Sequence[Signal]) -> Iterator[tuple[Array, list[Array], float]]:
-        """Yield times, values in SI units and position of the rows that have all of some signals.
+        """Yield times, values in SI units, and the share read so far, for the rows that have all these signals.
 
-        Times are NaN without a time column and a rate. Raises `BadDataset` for a row with an incomplete signal.
+        Times are NaN without time column and rate. Raises `BadDataset` for a row with an incomplete signal.
         """
         with self._named():
             yield from self._complete_rows(signals)
@@ -464,7 +464,7 @@ class Table:
         return "base" if form == "base_wrench" else "sensor"
 
     def _in_flange(self, wrench: Array, pose: Sequence[Array]) -> Array:
-        """Return wrenches (n, 6) in flange axes about the flange origin; wrenches in sensor axes are not changed."""
+        """Return wrenches (n, 6) in flange axes about the flange origin; wrenches in sensor axes stay unchanged."""
         force, torque = np.hsplit(self.options.sign * wrench, 2)
         if self._axes in ("sensor", "flange"):
             return np.hstack([force, torque])
@@ -477,7 +477,7 @@ class Table:
         return np.hstack([force, torque + np.cross(self.options.p_flange_tcp_m, force)])
 
     def _flange(self, values: Sequence[Array]) -> tuple[Array, Array | None]:
-        """Return R_base_flange (n, 3, 3), and p_base_flange_m (n, 3) or None, from orientation and position."""
+        """Return R_base_flange (n, 3, 3), and p_base_flange_m (n, 3) or None, from the orientation and the position."""
         orientation = self._found["orientation"]
         numbers, p = values[0], values[1] if len(values) > 1 else None
         form = "" if orientation is None else orientation.form
@@ -505,7 +505,7 @@ class Table:
 
 
 def _dwells(R: Array, wrench: Array) -> list[slice]:
-    """Return the row range of each dwell: 20 or more rows in one orientation without a step of the wrench (n, 6)."""
+    """Return the row range of each dwell: 20 or more rows in one orientation without a step in the wrench (n, 6)."""
     dwells: list[slice] = []
     first = 0
     for end in (*(np.flatnonzero(angle_between(R[1:], R[:-1]) > _AT_REST_RAD) + 1), len(R)):
@@ -524,7 +524,7 @@ def _dwells(R: Array, wrench: Array) -> list[slice]:
 
 
 def _without_steps(wrench: Array, first: int, last: int) -> list[slice]:
-    """Return the rows of a dwell split at steps of the wrench (n, 6), such as a tare, into parts of 20 rows or more."""
+    """Split a dwell at steps in the wrench (n, 6), such as a tare; return parts of 20 rows or more."""
     parts, waiting = list[slice](), [(first, last)]
     while waiting:
         first, last = waiting.pop()
@@ -552,7 +552,7 @@ def _wrong_row(row: int, words: str) -> str:
 
 
 def _of_angles(angles: Array, euler: str, axes: str) -> Array:
-    """Return the rotations (n, 3, 3) of angles (n, 3) about `axes`, applied in the order of `euler`."""
+    """Return the rotations (n, 3, 3) by angles (n, 3) about `axes`, applied in the order of `euler`."""
     sequence = _MAKERS.get(euler.lower(), euler)
     if sequence.lower() != axes and sorted(sequence.lower()) == sorted(axes):
         angles = angles[:, [axes.index(axis) for axis in sequence.lower()]]
@@ -560,7 +560,7 @@ def _of_angles(angles: Array, euler: str, axes: str) -> Array:
 
 
 def _rotations(form: str, numbers: Array) -> Array:
-    """Return the rotations (n, 3, 3) of the values (n, k) in this form. Raises `BadDataset`."""
+    """Return the rotations (n, 3, 3) that values (n, k) in this form describe. Raises `BadDataset`."""
     if form == "matrix":
         return proper_rotations(numbers.reshape(-1, 3, 3))
     length = np.linalg.norm(numbers, axis=1)
@@ -590,7 +590,7 @@ def _upright(gravity: Array) -> Array:
 
 
 def _unit_of_time(t: Array, name: str) -> str:
-    """Return the unit of times (n,): s unless the numbers exclude it. Raises `BadDataset` if two other units fit."""
+    """Return the unit of times (n,): s unless the numbers rule it out. Raises `BadDataset` if two other units fit."""
     t = t[np.isfinite(t)]
     steps = np.diff(t)
     steps = steps[steps > 0]

@@ -1,4 +1,4 @@
-"""Text tables of other programs; the format is recognised from the first lines."""
+"""Text tables from other programs; the format is recognised from the first lines."""
 
 import csv
 import gzip
@@ -18,7 +18,7 @@ from ftcalib.errors import BadDataset
 from ftcalib.files import open_file
 from ftcalib.model import Array
 
-# Sizes in characters: block, first part that is examined, longest header, longest line.
+# Sizes in characters: a block, the first part that is examined, the longest header, the longest line.
 _BLOCK, _FIRST, _HEAD, _LINE = 1 << 22, 1 << 16, 1 << 20, 1 << 18
 _SEPARATORS: Final = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
 _COMMENT = re.compile(r"\s*(#+|%+|//)\s*")
@@ -26,7 +26,7 @@ _NUMBER: Final = {
     ".": re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE),
     ",": re.compile(r"[+-]?(\d+(,\d*)?|,\d+)(e[+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE),
 }
-# Number of rows from which separator and decimal mark are recognised.
+# Number of rows from which the separator and the decimal mark are recognised.
 _DECIDE = 30
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?\s*(Z|[+-]\d\d:?\d\d)?")
 _UNIT = re.compile(r"[\[(]?\s*[-%°a-zA-Zµμ·*./^²0-9 ]{0,8}\s*[\])]?")
@@ -39,19 +39,19 @@ class _TextFormat(NamedTuple):
     separator: str
     decimal: str
     names: Sequence[str]
-    """Names of the columns as in the file; "1", "2", … without a header."""
+    """Names of the columns as in the file; "1", "2", … if it has no header."""
     units: Sequence[str]
-    """Units from a second row of the header; empty strings without one."""
+    """Units from a second header row; empty strings without one."""
     dates: Sequence[int]
     """Indices of columns with ISO 8601 dates, such as 2026-11-28 12:00:00.25."""
     first_line: int
-    """Number of the first row of numbers, from 1."""
+    """Line number of the first row of numbers, counted from 1."""
     words: str
     """Differences from a table with commas, decimal points and one row of names; empty if there are none."""
 
 
 class TextTable:
-    """A text table on disk; separator and decimal mark are recognised if not given. Raises `BadDataset`, `OSError`."""
+    """A text table on disk; recognises separator and decimal mark if not given. Raises `BadDataset` or `OSError`."""
 
     def __init__(self, path: Path, separator: str = "", decimal: str = "") -> None:
         self.path, self.comments = path, 0
@@ -64,7 +64,7 @@ class TextTable:
 
     @contextmanager
     def _open(self) -> Iterator[tuple[Any, IO[bytes]]]:
-        r"""Yield the text with `\n` as line end, and the file on disk. Other line breaks of Unicode belong to cells."""
+        r"""Yield the text with `\n` as line end, and the file on disk. Other Unicode line breaks belong to cells."""
         with open_file(self.path) as raw:
             packed = raw.read(2) == b"\x1f\x8b"
             raw.seek(0)
@@ -77,7 +77,7 @@ class TextTable:
                 raise BadDataset("the compressed file is damaged or incomplete: unpack the readable part") from error
 
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
-        """Yield columns (n, k) of consecutive rows, with the share of the file that is read.
+        """Yield the columns (n, k) of consecutive rows, with the share of the file read so far.
 
         A blank cell is NaN, and a date is the time since 1970, s. Raises `BadDataset` after the last valid block.
         """
@@ -117,7 +117,7 @@ class TextTable:
         return numbers
 
     def _numbers(self, lines: Sequence[str], separator: str, use: Sequence[int]) -> Array | None:
-        """Return columns of lines as read by numpy; None if numpy rejects a cell, such as a blank one, or a row."""
+        """Return the columns of lines, read by numpy; None if numpy rejects a row or a cell, such as a blank one."""
         if not (rows := list(filter(None, lines))):
             return None
         kinds = dict.fromkeys(range(len(self.names)), "U1") | dict.fromkeys(use, "f8")
@@ -126,19 +126,19 @@ class TextTable:
         try:
             table = np.loadtxt(rows, of_columns, comments=None, delimiter=separator, ndmin=1, quotechar='"')
             columns = [table[str(i)] if kinds[i] == "f8" else self._dates(table[str(i)], self.names[i]) for i in use]
-            # An unclosed quote would include the rows below in its cell.
+            # The cell of an unclosed quote would include the rows below.
             return np.column_stack(columns) if len(table) == len(rows) else None
         except (BadDataset, ValueError):
             return None
 
     def _dates(self, cells: NDArray[np.str_], name: str) -> Array:
-        """Return the times since 1970 of dates (n,), s. Raises `BadDataset` or `ValueError`."""
+        """Return dates (n,) as times since 1970, s. Raises `BadDataset` or `ValueError`."""
         if all((match := _DATE.fullmatch(cell)) and not match[3] for cell in cells.tolist()):
             return seconds_of(cells.astype("datetime64[ns]"))
         return np.array([self._number(cell.strip(), name, 0) for cell in cells.tolist()])
 
     def _slowly_parsed(self, text: str, use: Sequence[int], first: int) -> Array:
-        """Return columns of a text that numpy rejects, such as with quoted separators. Raises `BadDataset`."""
+        """Return the columns of a text that numpy rejects, such as one with quoted separators. Raises `BadDataset`."""
         count, rows = len(self.names), []
         for line, one in enumerate(text.split("\n"), first):
             row = _split(one, self.format.separator)
@@ -171,13 +171,13 @@ class TextTable:
 
 
 def seconds_of(dates: NDArray[Any]) -> Array:
-    """Return the times since 1970 of dates (n,), s."""
+    """Return dates (n,) as times since 1970, s."""
     known = dates.astype("datetime64[ns]")
     return np.where(np.isnat(known), np.nan, known.astype(np.int64) * 1e-9)
 
 
 def _format_in(text: IO[str], separator: str, decimal: str) -> _TextFormat:
-    """Return the format of a text, recognised from as many first lines as needed. Raises `BadDataset`."""
+    """Return the format of a text, recognised from as many of its first lines as needed. Raises `BadDataset`."""
     head = text.read(_FIRST)
     while True:
         more = text.read(len(head))
@@ -224,7 +224,7 @@ def _format_of(head: str, more: bool, separator: str, decimal: str) -> _TextForm
 
 
 def _decided(lines: Sequence[str], separator: str, decimal: str) -> tuple[str, str, int, int]:
-    """Return separator, decimal mark, and numbers of columns and of numbers per row, for the most numbers in cells."""
+    """Return the separator and decimal mark that give the most numbers, and the columns and numbers per row."""
     last = [line for line in lines if line.strip() and not _COMMENT.match(line)][-_DECIDE:]
     best = (",", ".", 0, 0)
     most = 0.0
@@ -235,7 +235,7 @@ def _decided(lines: Sequence[str], separator: str, decimal: str) -> tuple[str, s
         rows = [row for row in rows if len(row) == count]
         for point in decimal or ("." if between == "," else ".,"):
             numbers = [_count_numbers(row, point) for row in rows]
-            # Other cells reduce the score, because `1,5;2,5` has numbers between commas too.
+            # Cells of other text reduce the score, because `1,5;2,5` has numbers between commas too.
             score = sum(2 * n - sum(map(bool, row)) for n, row in zip(numbers, rows, strict=True) if n)
             if numbers and min(count, max(numbers)) > 1 and score > most:
                 best, most = (between, point, count, max(numbers)), score
@@ -282,7 +282,7 @@ def _header(line: str, separator: str, count: int, ended: bool) -> list[str]:
     line = line[found.end() :] if (found := _COMMENT.match(line)) else line
     for other in (separator, *_SEPARATORS):
         cells = _split(line, other)
-        if len(cells) == count - 1 and count > 2:  # R leaves out the name of the row numbers
+        if len(cells) == count - 1 and count > 2:  # R writes no name for the column of row numbers
             cells = [*cells, ""] if ended else ["", *cells]
         if len(cells) == count and not all(_NUMBER["."].fullmatch(cell) for cell in cells):
             return cells
