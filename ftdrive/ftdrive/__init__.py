@@ -13,12 +13,12 @@ Their modules may move; these names stay.
 | errors | `FtdriveError`, `UsageError`, `DeviceError`, `DataError`, `AcceptanceError` |
 
 Two packages come with it. `ftcalib` has the parts of the solver, such as `Parameters`, `predict`, `Compensator` and
-`solve_loads`. `ftdrivers` has the parts of a custom driver, such as `StreamingSensor` and `ReadOnlyArm`.
+`solve_loads`. `ftdrivers` has the parts for a custom driver, such as `StreamingSensor` and `ReadOnlyArm`.
 """
 
 from importlib import import_module
 
-TYPE_CHECKING = False  # as in `typing`, whose import would take most of the time
+TYPE_CHECKING = False  # as in `typing`, which would take most of the import time
 if TYPE_CHECKING:
     from ftcalib.compare import compare
     from ftcalib.data.dataset import CalibrationDataset
@@ -87,7 +87,7 @@ def __dir__() -> list[str]:
     return __all__
 
 
-if not TYPE_CHECKING:  # a type checker would accept any name
+if not TYPE_CHECKING:  # otherwise, a type checker would accept any name
 
     def __getattr__(name: str) -> object:
         for module, names in _MODULES.items():

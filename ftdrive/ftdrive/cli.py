@@ -28,12 +28,12 @@ Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device
 141 the reader of the output has ended."""
 
 
-# click reads this attribute from the class for every command.
+# click reads this class attribute for every command.
 click.Context.formatter_class = WholeWords
 
-# Exit code that shells report for a program ended by SIGPIPE.
+# Exit code that shells report for a program that SIGPIPE ended.
 _CLOSED_PIPE = 128 + 13
-# Hang-up signals of a closed terminal; later errors are their consequence.
+# Hang-up signals received because the terminal was closed; errors after them are a consequence.
 _closed_terminals: list[int] = []
 
 
@@ -41,7 +41,7 @@ _closed_terminals: list[int] = []
 def _closed_pipe() -> Iterator[None]:
     try:
         yield
-    except BrokenPipeError as error:  # click would exit with 1 for any pipe or socket
+    except BrokenPipeError as error:  # click would exit with 1 for every broken pipe or socket
         from ftdrive.terminal.supervisor import Supervisor
 
         if any(Supervisor(sys.stdin, stream, "it").absence() for stream in (sys.stdout, sys.stderr)):
@@ -50,7 +50,7 @@ def _closed_pipe() -> Iterator[None]:
 
 
 class _LazyGroup(click.Group):
-    """A group whose commands are imported when called: `modules` maps each name to its module and help line.
+    """A group whose commands are imported only when called: `modules` maps each name to its module and help line.
 
     For a mistyped command, the most similar name is proposed.
     """
@@ -148,17 +148,17 @@ class _MessageHandler(logging.Handler):
 
 def main() -> int:
     """Run the command line; return the exit code."""
-    # The matrices of a calibration are small: threads of linear algebra wait for each other longer than they compute.
-    # numpy reads this variable when it is imported, later.
+    # The matrices of a calibration are small: linear-algebra threads would wait for each other longer than they
+    # compute. numpy reads this variable later, when it is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Ctrl-C, `kill` and a closed terminal all end a command in the same way: the arm is stopped first. Set the handlers
-    # even if these signals are inherited as ignored, as in a background job, except for `nohup`.
+    # even if these signals are inherited as ignored, as in a background job, but leave SIGHUP ignored under `nohup`.
     for name in ("SIGINT", "SIGTERM"):
         signal.signal(getattr(signal, name), signal.default_int_handler)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
         signal.signal(signal.SIGHUP, _hang_up)
     _open_closed_streams()
-    # A garbage collection at exit would take 0.5 s on a busy computer, and the memory is freed anyway.
+    # Garbage collection at exit would take 0.5 s on a busy computer, and the memory is freed anyway.
     atexit.register(gc.freeze)
     code = run(sys.argv[1:])
     is_dead = _leave_dead_streams()
@@ -201,7 +201,7 @@ def run(arguments: Sequence[str]) -> int:
         if not _closed_terminals:
             raise
         code = 1
-    if _closed_terminals:  # the cause of any other error
+    if _closed_terminals:  # this is the cause of any other error
         _say("error: the terminal was closed")
         return exit_code(SupervisorGone("")) or code
     return code
@@ -220,7 +220,7 @@ def _run(arguments: Sequence[str]) -> int:
         code = exit_code(error)
         if code is None or _closed_terminals:
             raise
-        # a file of the wrong kind is the cause of the error
+        # a file of the wrong kind may be the cause of the error
         about = str(error) if isinstance(error, UsageError) else ""
         other = _other_command(arguments, about) if isinstance(error, DataError | UsageError | OSError) else ""
         _say(f"error: {in_one_line(other or in_a_sentence(error))}")

@@ -1,4 +1,4 @@
-"""Errors of the application, derived from those of `ftcalib.errors`, and the exit code of each error."""
+"""Errors of the application, derived from those in `ftcalib.errors`, and the exit code for each error."""
 
 import platform
 import sys
@@ -10,7 +10,7 @@ from ftdrivers.errors import ConnectError, DeviceFault
 
 
 class ConfigError(UsageError):
-    """The configuration or the combination of options cannot be used."""
+    """The configuration or the combination of options is not usable."""
 
 
 class BadPlan(DataError):
@@ -42,7 +42,7 @@ class NotAccepted(AcceptanceError):
 
 
 class PlanRefused(NotAccepted):
-    """No motion is proven clear, or a plan was made for another cell."""
+    """No motion can be proven clear, or a plan was made for another cell."""
 
 
 class Declined(FtdriveError):
@@ -59,7 +59,7 @@ class SupervisorGone(FtdriveError):
         super().__init__(f"{why}: {effect}")
 
 
-# The first matching class determines the code.
+# The first class that matches determines the code.
 _EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (UsageError, 2),
     (ConnectError, 3),
@@ -77,12 +77,12 @@ _EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
 def exit_code(error: BaseException) -> int | None:
     """Return the exit code of an error that a user can fix; None for a defect of ftdrive."""
     if isinstance(error, ModuleNotFoundError) and error.name in sys.stdlib_module_names:
-        return 2  # a module missing on this system, such as `termios` on Windows
+        return 2  # a module that this system lacks, such as `termios` on Windows
     return next((code for kind, code in _EXIT_CODES if isinstance(error, kind)), None)
 
 
 def in_a_sentence(error: BaseException) -> str:
-    """Return the message of an error; for an operating system error also the file and what to check."""
+    """Return the message of an error; for an operating-system error, add the file and what to check."""
     if isinstance(error, ModuleNotFoundError):
         return f"Python on {platform.system()} has no module {error.name}, which is needed here: use Linux"
     if isinstance(error, OSError) and error.filename is not None:

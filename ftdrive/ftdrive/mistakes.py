@@ -1,4 +1,4 @@
-"""Proposals for a command line that cannot run: another command for this file, or an existing name."""
+"""Suggestions for a command line that cannot run: another command for this file, or an existing name."""
 
 import re
 import shlex
@@ -15,17 +15,17 @@ from ftdrive.runs import is_run
 
 
 class Kind(NamedTuple):
-    """A kind of file, and the commands and options that accept it."""
+    """A kind of file, with the commands and options that accept it."""
 
     words: str
     lines: tuple[str, ...]
     """The usual commands for such a file, as typed."""
     others: tuple[str, ...] = ()
-    """Further commands that accept such a file."""
+    """Other commands that accept such a file."""
 
     @property
     def places(self) -> set[str]:
-        """Places of such a file: options, and commands that take it as an argument."""
+        """Where such a file may be given: options, and commands that take it as an argument."""
         heads = (line.partition(" {}")[0] for line in (*self.lines, *self.others))
         return {head.rpartition(" ")[2] if " --" in head else head for head in heads}
 
@@ -77,7 +77,7 @@ KINDS: Final[Mapping[str, Kind]] = {
 _TEXTS, _BINARIES = {".csv", ".tsv", ".txt", ".dat", ".log"}, {".parquet", ".db3", ".bag", ".mcap"}
 _TWO_NUMBERS = re.compile(rb"\d[\s,;]+[-+.]?\d")
 _FORMAT = re.compile(rb"ftdrive\.(\w+)/\d")
-# A section of a TOML file that describes a cell.
+# Header of a section in a TOML file that describes a cell.
 _CELL = re.compile(rb"^\[(?:robot|sensor|tool|workcell)\]", re.MULTILINE)
 _START = 4096
 _ALIKE = 0.75
@@ -114,7 +114,7 @@ def _runs_in(folder: Path) -> Iterator[Path]:
 
 
 def other_command(group: click.Group, arguments: Sequence[str], about: str = "") -> str:
-    """Return the commands that accept the first file that this command does not accept; empty if there is none.
+    """Return the commands for the first file that this command does not accept; empty if there is none.
 
     With the error message `about`, only files that it names are considered.
     """
@@ -131,7 +131,7 @@ def other_command(group: click.Group, arguments: Sequence[str], about: str = "")
         if " " in place:
             own += [line for line in (*KINDS[kind].lines, *KINDS[kind].others) if line.split()[0] == place.split()[0]]
         lines = [f"ftdrive {line.format(shlex.quote(str(path)))}" for line in dict.fromkeys([*own, *KINDS[kind].lines])]
-        # another place accepts this file, or this place accepts another file
+        # another command or option accepts this file, or this one accepts another file
         better = path if path != Path(name) else next(_runs_in(path), None) if kind == "runs" else None
         if better is not None:
             given = arguments[number].removesuffix(name) + str(better)
@@ -143,7 +143,7 @@ def other_command(group: click.Group, arguments: Sequence[str], about: str = "")
 
 
 def _unmatched_arguments(group: click.Group, arguments: Sequence[str]) -> Iterator[tuple[int, str, str, click.Command]]:
-    """Yield number, place, name and command of each argument that is an input file, or that no command expects."""
+    """Yield number, place, name and command for each argument that is an input file, or that no command expects."""
     command: click.Command = group
     words, option, number_of_place = list[str](), "", 0
     for number, argument in enumerate(arguments):
@@ -175,7 +175,7 @@ def _is_read(parameter: click.Parameter) -> bool:
 
 
 def similar_path(group: click.Group, arguments: Sequence[str]) -> str:
-    """Return a sentence with a path similar to the missing one, or with the way to find one."""
+    """Return a sentence with a path similar to the missing one, or with how to find one."""
     for _, _, name, _ in _unmatched_arguments(group, arguments):
         path = Path(name)
         if path.exists():
@@ -183,13 +183,13 @@ def similar_path(group: click.Group, arguments: Sequence[str]) -> str:
         with suppress(OSError):
             if found := get_close_matches(path.name, [one.name for one in path.parent.iterdir()], 1, _ALIKE):
                 return _question([str(path.with_name(found[0]))])
-        # not for a plan, a table or a list of cells, which `history` does not list
+        # not for plans, tables or lists of cells, which `history` does not list
         return " `ftdrive history` lists your runs." if path.suffix in {"", ".json"} else ""
     return ""
 
 
 def close_command(name: str, names: Sequence[str]) -> str:
-    """Return a question with the command most similar to a mistyped one; empty if there is none."""
+    """Return a question that proposes the command most similar to a mistyped one; empty if there is none."""
     return _question(get_close_matches(name, names, 1))
 
 
@@ -199,13 +199,13 @@ def _question(names: Iterable[str]) -> str:
 
 
 def missing_parameters(error: click.MissingParameter, arguments: Sequence[str]) -> str:
-    """Return all missing parameters of a line, of which `click` names only the first, and the complete line."""
+    """Return a message with all missing parameters, of which `click` names only the first, and the complete line."""
     context = error.ctx
     if context is None or context.info_name not in arguments:
         return error.format_message()
     command, typed = context.command, list(arguments[arguments.index(context.info_name) + 1 :])
     given, _, _ = command.make_parser(context).parse_args(list(typed))
-    # the value of a missing parameter depends on the version of `click`, but is never text
+    # the value of a missing parameter depends on the `click` version, but is never text
     absent = [
         one for one in command.params if one.required and not isinstance(given.get(one.name or ""), str | tuple | list)
     ]
@@ -219,7 +219,7 @@ def missing_parameters(error: click.MissingParameter, arguments: Sequence[str]) 
 
 
 def without_value(error: click.BadOptionUsage, group: click.Group, arguments: Sequence[str]) -> str:
-    """Return the line with a placeholder after an option that lacks its value."""
+    """Return the error, and the line with a placeholder after the option that lacks its value."""
     command: click.Command = group
     words = ["ftdrive"]
     for argument in arguments:
@@ -233,11 +233,11 @@ def without_value(error: click.BadOptionUsage, group: click.Group, arguments: Se
 
 
 def of_subcommand(error: click.NoSuchOption, arguments: Sequence[str]) -> str:
-    """Return the line with the option after the subcommand that has it, or the plain error."""
+    """Return the error and the line with the option after the subcommand that has it, or only the error."""
     context = error.ctx
     if context is not None and isinstance(group := context.command, click.Group):
         names = group.list_commands(context)
-        # only for subcommands, because importing all commands takes a second
+        # only among subcommands, because importing all commands takes a second
         for name in [one for one in names if one in arguments] or (names if context.parent else []):
             command = group.get_command(context, name)
             if command is not None and any(error.option_name in one.opts for one in command.params):

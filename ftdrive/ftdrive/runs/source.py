@@ -1,4 +1,4 @@
-"""Reads and solves the data sources that commands accept: run folders, datasets and tables."""
+"""Reading and solving of the data that commands accept: run folders, datasets and tables."""
 
 import hashlib
 import tomllib

@@ -1,6 +1,6 @@
 """The store of results and verifications: an index of run folders, which remain the source of the data.
 
-Functions import the database only when they need it, because most commands do not use the store.
+Functions import the database only when needed, because most commands do not use the store.
 """
 
 from collections.abc import Callable
@@ -15,23 +15,23 @@ if TYPE_CHECKING:
 
 
 def store_url() -> str | None:
-    """Return [store] url from environment and files; None for the default store of the user."""
+    """Return `[store] url` from the environment and the files; None for the user's default store."""
     url: str | None = settings()["store.url"].value
     return url
 
 
 def open_store(url: str | None = None) -> "Store":
-    """Return the store at an address, by default the address in environment and files."""
+    """Return the store at an address, by default the one in the environment and the files."""
     from ftdrive.store.store import Store
 
     return Store(url or store_url())
 
 
 def index_run(folder: Path, say: Callable[[str], object], cell: CellConfig | None = None) -> None:
-    """Add a run, and the other new runs in its parent folder, to the store; report an error by one call of `say`.
+    """Add a run, and the other new runs in its parent folder, to the store; report an error by one call to `say`.
 
-    The run folder is complete without the store, and a later call adds it. Without `cell` the store is that of
-    environment and files.
+    The run folder is complete without the store, and a later call adds it. Without `cell`, the store is the one in the
+    environment and the files.
     """
     from ftdrive.store.store import Store
 

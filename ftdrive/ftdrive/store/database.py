@@ -1,7 +1,7 @@
 """The database of a store: address, lock, tables with their version, and error messages.
 
-The columns are the fields of the records. A change of the fields of results, verifications or weighings must increase
-`SCHEMA`; an older index is then rebuilt from its files.
+The columns are the fields of the records. Every change to the fields of results, verifications or weighings must
+increase `SCHEMA`; an older index is then rebuilt from its files.
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -41,7 +41,7 @@ from ftdrive.runs.weighings import REFUSALS, WeighingDay
 from ftdrive.store.records import Record, StoredCell, StoredResult
 from ftdrivers.installation import missing_extra
 
-# Version of the index, stored in the database.
+# Version of the index; the database stores it.
 SCHEMA: Final = 4
 
 AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
@@ -56,7 +56,7 @@ _TYPES: Final = {str: String, int: Integer, float: Float, bool: Boolean}
 def _define_table(
     name: str, record: type, *more: Column[Any], key: str = "id", index: Collection[str] = (), without: Collection[str]
 ) -> Table:
-    """Return a table with the fields of a record, as JSON if no other column type fits, and `more` columns."""
+    """Return a table with the fields of a record (as JSON if no other column type fits) and `more` columns."""
     columns = list[Column[Any]]()
     for field, hint in get_type_hints(record).items():
         is_optional = isinstance(hint, UnionType)
@@ -96,9 +96,9 @@ RECORDS: Final[Mapping[type[Record], Table]] = {
     WeighingDay: weighings,
 }
 
-# Collation that sorts strings in the same order in both databases.
+# Collation that gives strings the same order in both databases.
 _BYTE_ORDER: Final = {"sqlite": "BINARY", "postgresql": "C"}
-# Key of the advisory lock of all writers: "ftdrive" in ASCII.
+# Key of the advisory lock that all writers take: "ftdrive" in ASCII.
 _WRITERS: Final = 0x66746472697665
 
 
@@ -146,15 +146,15 @@ class Database:
     def writing(self) -> Iterator[Connection]:
         """Yield a connection as the only writer, and commit at the end.
 
-        Missing tables are created. The index of an older version is replaced by an empty one; cells are kept.
+        Missing tables are created. An index of an older version is replaced by an empty one; cells are kept.
         """
-        # One lock for all writers, because row locks of two writers may cause a deadlock.
+        # All writers share one lock, because the row locks of two writers may cause a deadlock.
         if self._file is not None:
             with self._naming_store("written"):
                 self._file.parent.mkdir(parents=True, exist_ok=True)
         with self._connected("written") as connection:
             if self._is_sqlite:
-                connection.exec_driver_sql("BEGIN IMMEDIATE")  # two writers that read first would block each other
+                connection.exec_driver_sql("BEGIN IMMEDIATE")  # two writers that both read first would block each other
             else:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _WRITERS})
             if self._version(connection) != SCHEMA:
@@ -172,7 +172,7 @@ class Database:
     def upsert(self, table: Table, first_by: str | None = None) -> Any:
         """Return a statement that inserts rows, or replaces rows with the same primary key.
 
-        With `first_by`, only rows with a greater string in this column are replaced.
+        With `first_by`, a row is replaced only if the new string in this column does not sort after the stored one.
         """
         insert = import_module(f"sqlalchemy.dialects.{self._dialect}").insert(table)  # importing both is slow
         new = {column.name: insert.excluded[column.name] for column in table.columns}
@@ -183,7 +183,7 @@ class Database:
         return insert.on_conflict_do_update(index_elements=key, set_=new, where=where)
 
     def _version(self, connection: Connection) -> int | None:
-        """Return the version of the tables; 0 if it is missing, None without tables."""
+        """Return the version of the tables; 0 if it is missing, None if there are no tables."""
         # There are no migrations, because an older index is rebuilt from the run folders.
         if not inspect(connection).has_table(schema.name):
             return None
@@ -197,12 +197,12 @@ class Database:
 
     @property
     def _file(self) -> Path | None:
-        """SQLite file; None for a server, a database in memory, or a file: URI."""
+        """SQLite file; None for a server, an in-memory database, or a file: URI."""
         path = self._url.database or ""
         return Path(path) if self._is_sqlite and path and not path.startswith("file:") else None
 
     def _limits(self) -> dict[str, Any]:
-        """Return the time-outs of the driver for locks and for a server that does not answer."""
+        """Return the driver's time-outs for locks and for a server that does not answer."""
         if self._is_sqlite:
             return {"timeout": self._wait_s}
         wait_s = max(2, round(self._wait_s))
@@ -234,7 +234,7 @@ class Database:
 
 
 def all_paths(connection: Connection) -> set[str]:
-    """Return the path of every record, in an index of any version."""
+    """Return the paths of all records in an index of any version."""
     existing = {*inspect(connection).get_table_names()}
     tables = [table for table in RECORDS.values() if table.name in existing]
     return {path for table in tables for path in connection.scalars(select(table.c.path))}

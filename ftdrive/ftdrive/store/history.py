@@ -11,7 +11,7 @@ from ftdrive.store.records import StoredResult
 if TYPE_CHECKING:
     from ftdrive.store.trends import QuantityTrend
 
-# Largest age of a calibration or its last verification, in days, without a warning.
+# Largest age, in days, of a calibration or of its last verification without a warning.
 OLD_DAYS: Final = 30.0
 OTHER_TEMPERATURE_K: Final = 10.0
 # Smallest number of results for a trend.
@@ -26,7 +26,7 @@ def age_days(created_utc: str | None, now: datetime) -> float | None:
 def drifts(results: Sequence[StoredResult]) -> list["QuantityTrend"]:
     """Return the trends of each tool with at least three accepted results over three days or more."""
     long = [series for series in _series(results) if len(series) >= _FEWEST]
-    if not long:  # avoid the import of numpy, which takes as long as the rest of the command
+    if not long:  # avoid importing numpy, which takes as long as the rest of the command
         return []
     from ftdrive.store.trends import trends_of
 
@@ -56,7 +56,7 @@ def warnings(
 
 
 def _series(results: Sequence[StoredResult]) -> Iterator[list[StoredResult]]:
-    """Yield the accepted results of each tool on each arm, sensor and mount, the oldest first."""
+    """Yield the accepted results for each tool on each arm, sensor and mount, the oldest first."""
 
     def cell(result: StoredResult) -> tuple[str, ...]:
         return tuple(str(part) for part in (result.tool, result.arm_serial, result.sensor_serial, result.mount))

@@ -1,4 +1,4 @@
-"""Records of the store: results, verifications and weighings from run folders, and configured cells."""
+"""Records in the store: results, verifications and weighings from run folders, and configured cells."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -12,7 +12,7 @@ from ftdrive.runs.calibration import EMULATED, at, marks_of, number_at, numbers_
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.runs.weighings import FILES, FOLDER, WeighingDay
 
-# A list of results must not import numpy.
+# Listing results must not import numpy.
 if TYPE_CHECKING:
     from ftcalib.model import Array, Parameters
 
@@ -35,7 +35,7 @@ class StoredResult:
     sensor_serial: str | None
     sensor_model: str | None
     robot_host: str | None
-    """Address of the controller in the configuration of the run."""
+    """Address of the controller in the run's configuration."""
     mount: str | None
     verdict: str
     n_poses: int
@@ -49,9 +49,9 @@ class StoredResult:
     update: str | None
     """Kind of the update, such as "bias"; None for a full calibration."""
     temperature_C: float | None
-    """Temperature of the sensor, if it reports one."""
+    """Temperature of the sensor; None if it reports none."""
     payload_kg: float | None
-    """Payload that the controller reported during the calibration."""
+    """Payload that the controller reported during the calibration, kg."""
     payload_com_m: list[float] | None
     """(3,) centre of mass of this payload, flange axes."""
     emulated: bool = False
@@ -59,7 +59,7 @@ class StoredResult:
 
     @property
     def parameters(self) -> "Parameters":
-        """Estimates; with `covariance` the record satisfies `ftcalib.after.series.Estimated`."""
+        """Estimates; with `covariance`, they make the record an `ftcalib.after.series.Estimated`."""
         import numpy as np
 
         from ftcalib.model import Parameters
@@ -75,7 +75,7 @@ class StoredResult:
 
     @property
     def mass_sigma_kg(self) -> float:
-        """Standard deviation of the mass, without the gain error, which all results of a sensor have in common."""
+        """Standard deviation of the mass, without the gain error, which is common to all results of a sensor."""
         return self.parameters.weight_sigma_N(self.covariance) / self.g_m_s2
 
     def to_dict(self, age_days: float | None, check: VerificationRecord | None) -> dict[str, Any]:
@@ -112,7 +112,7 @@ class StoredCell:
 
 
 Record = StoredResult | VerificationRecord | WeighingDay
-# Fields of a verification in the store and in the list of results.
+# Fields of a verification that the store and the list of results contain.
 STORED: Final = (
     *("id", "path", "run", "calibration_id", "created_utc", "passed", "change", "reason", "temperature_C"),
     *("bias_change", "bias_change_sigma", "calibration_sigma"),
@@ -120,7 +120,7 @@ STORED: Final = (
 
 
 def record_paths(folders: Iterable[Path]) -> list[Path]:
-    """Return the files that become records in run folders or folders of runs. Weighings count as a run folder."""
+    """Return the files in run folders, or in folders of runs, that become records. Weighings count as a run folder."""
     folders = [folder.resolve() for folder in folders]
     weighings = (path for folder in folders for path in (folder, folder / FOLDER) if path.name == FOLDER)
     names = ("calibration*.json", "verification*.json", FILES)
@@ -129,7 +129,7 @@ def record_paths(folders: Iterable[Path]) -> list[Path]:
 
 
 def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
-    """Return the records of files, and a description of each file that could not be read."""
+    """Return the records in these files, and a description of each file that could not be read."""
     records, unreadable = list[Record](), list[str]()
     for path in paths:
         try:
@@ -140,7 +140,7 @@ def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
 
 
 def _read_record_file(path: Path) -> Record:
-    """Return the record of a file, ignoring unknown fields.
+    """Return the record in a file, ignoring unknown fields.
 
     Raises `BadCalibration` or `BadDataset` for a damaged file or another format, and `OSError`.
     """
@@ -156,7 +156,7 @@ def _result(path: Path) -> StoredResult:
     result = CalibrationResult.load(path)
     try:
         header = Run(path.parent).header()
-    except (DataError, OSError):  # the calibration file alone is sufficient
+    except (DataError, OSError):  # the calibration file alone is enough
         header = {}
     provenance, setup = result.provenance, at(result.provenance, "setup")
     named = provenance if at(provenance, "devices") else header

@@ -1,4 +1,4 @@
-"""The store: an index of results, verifications and weighings, which can be rebuilt from run folders, and cells."""
+"""The store: cells, and an index of results, verifications and weighings, which can be rebuilt from run folders."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -16,7 +16,7 @@ from ftdrive.store import database
 from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import STORED, Record, StoredCell, StoredResult, read_records, record_paths
 
-# Time-out for the lock of another writer, s.
+# Time-out for another writer's lock, s.
 WAIT_S = 5.0
 
 _MOST = 5000
@@ -26,7 +26,7 @@ _Stored = TypeVar("_Stored")
 
 @dataclass(frozen=True, slots=True)
 class Indexed:
-    """Numbers of records that a call of `Store.index` has read."""
+    """Numbers of records that a call of `Store.index` read."""
 
     results: int
     verifications: int
@@ -39,10 +39,10 @@ class Indexed:
 class Store:
     """An index of run folders, and the cells of a fleet; the database is opened by the first method call.
 
-    `url` is the address of an SQLite file or a PostgreSQL database in the form of SQLAlchemy, by default a file of the
-    user. `wait_s` is the time-out for another writer, and for a server that does not answer. Raises `ConfigError` for
-    an invalid address or a missing driver. Every method raises `BadStore` if the database cannot be read or written, or
-    has a newer version.
+    `url` is the address of an SQLite file or a PostgreSQL database in the form of SQLAlchemy, by default a file in the
+    user's data folder. `wait_s` is the time-out for another writer, and for a server that does not answer. Raises
+    `ConfigError` for an invalid address or a missing driver. Every method raises `BadStore` if the database cannot be
+    read or written, or if its version is newer.
     """
 
     def __init__(self, url: str | None = None, *, wait_s: float = WAIT_S) -> None:
@@ -62,7 +62,7 @@ class Store:
     # -------------------------------------------------------------------------------------------------------- writing
 
     def index(self, *folders: Path) -> Indexed:
-        """Add the new files in these run folders, or in the run folders that they contain; return their numbers.
+        """Add the new files in these run folders, or in the run folders that they contain; return how many were added.
 
         A file with a known path is not read again, because files of a run are never overwritten; a file of weighings
         is read again if it has grown.
@@ -89,7 +89,7 @@ class Store:
             self._write(connection, [record])
 
     def put_cells(self, cells: Iterable[StoredCell]) -> None:
-        """Insert cells, or replace cells of the same name; all of them or none."""
+        """Insert cells, replacing those with the same name; all of them or none."""
         if rows := [_to_row(cell) for cell in cells]:
             with self._current.writing() as connection:
                 connection.execute(self._database.upsert(database.cells), rows)
@@ -111,8 +111,8 @@ class Store:
         return Indexed(results, verifications, weighings, unreadable)
 
     def _write(self, connection: Connection, records: Sequence[Record], forget: Sequence[str] = ()) -> None:
-        """Insert records; of several files with the same content, the first path is stored."""
-        # The key is the content: a copied or moved run is one result, also on two computers.
+        """Insert records; for several files with the same content, store the path that sorts first."""
+        # The key is the content: a run that was copied or moved counts once, even on two computers.
         for kind, table in database.RECORDS.items():
             rows = [_to_row(record) for record in records if isinstance(record, kind)]
             same = _paths_where(connection, table, table.c.id, [row["id"] for row in rows])
@@ -144,7 +144,7 @@ class Store:
         return next(reversed(self.verifications(calibration_id)), None)
 
     def weighings(self, most: int, tool: str | None = None) -> list[WeighingDay]:
-        """Return the weighings of the last `most` days that have any, of all tools or of one tool, the oldest first."""
+        """Return the last `most` daily records of weighings, with all tools or with one tool, the oldest first."""
         table = database.weighings
         newest_first = (table.c.day.desc(), table.c.last_utc.desc().nulls_last(), table.c.id)
         query = select(table).where(*_is(table.c.tool, tool)).order_by(*newest_first).limit(most)
@@ -163,8 +163,8 @@ class Store:
     ) -> tuple[list[StoredCell], list[StoredResult], list[VerificationRecord], list[WeighingDay]]:
         """Return cells, results, verifications and weighings of a fleet from one database connection, the oldest first.
 
-        The results are the `newest` accepted ones of each tool on each arm; verifications and weighings are those since
-        a time, weighings as in `last_weighings`.
+        The results are the `newest` accepted ones for each tool on each arm. Verifications and weighings are those
+        since a time; weighings are selected as in `last_weighings`.
         """
         start = since.astimezone(UTC).isoformat(timespec="microseconds")
         checks = select(database.verifications).where(database.verifications.c.created_utc >= start)
@@ -186,7 +186,7 @@ def _query(connection: Connection | None, query: Select[Any], make: Callable[[Ro
 
 
 def _paths_in_store(connection: Connection, paths: Sequence[Path]) -> set[str]:
-    """Return the paths whose whole file is in the store."""
+    """Return the paths of the files that are completely in the store."""
     texts = [str(path) for path in paths]
     known = {
         path for table in database.RECORDS.values() for path in _paths_where(connection, table, table.c.path, texts)
@@ -201,7 +201,7 @@ def _paths_in_store(connection: Connection, paths: Sequence[Path]) -> set[str]:
 
 
 def _paths_where(connection: Connection, table: Table, column: Column[Any], values: Sequence[str]) -> Iterator[str]:
-    """Yield the paths of the rows with one of the values in a column, in statements of limited size."""
+    """Yield the paths of the rows that have one of the values in a column, in statements of limited size."""
     for start in range(0, len(values), _MOST):
         yield from connection.scalars(select(table.c.path).where(column.in_(values[start : start + _MOST])))
 
@@ -225,7 +225,7 @@ def _newest_accepted(most: int) -> Select[Any]:
 
 
 def _last_weighings(since_day: str, tool: str | None = None) -> Select[Any]:
-    """Return a query for the files of the last day of each tool on each arm."""
+    """Return a query for the files of the last day with each tool on each arm."""
     table = database.weighings
     key = (table.c.tool, table.c.arm_serial, table.c.robot_host, table.c.emulated)
     rank = func.rank().over(partition_by=key, order_by=table.c.day.desc()).label("rank")

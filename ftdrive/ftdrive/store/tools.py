@@ -1,4 +1,4 @@
-"""Named tools: the newest accepted calibration of a tool on this arm, with this sensor and mount."""
+"""Named tools: the newest accepted calibration of a tool on this arm, sensor and mount."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -15,19 +15,19 @@ from ftdrive.store.store import Store
 from ftdrive.store.trends import sensor_biases
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 
-# Folder that is searched besides the store, for runs that are not indexed yet.
+# Folder searched in addition to the store, for runs that are not indexed yet.
 RUNS = Path("runs")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tool:
-    """Calibration of a named tool."""
+    """The calibration of a named tool."""
 
     calibration: CalibrationResult
     path: Path
     warnings: tuple[str, ...]
     temperature: BiasTemperature | None = None
-    """Dependence of the sensor bias on its temperature, if it improves the prediction of other runs."""
+    """Dependence of the sensor's bias on its temperature; None unless it improves the prediction of other runs."""
     hour_change: Array | None = None
     """(6,) standard deviation of the change of the bias in one hour, N and N·m; None without enough runs."""
 
@@ -43,9 +43,9 @@ def calibration_of_tool(
 ) -> Tool:
     """Return the newest accepted calibration of a tool, a `[tool] name`, on these devices and this `[sensor] mount`.
 
-    With `force` and no calibration of these devices, use the newest of any devices, even if edited by hand. `url` is
-    the address of the store. Raises `ConfigError` without a calibration, and names the tools calibrated on these
-    devices.
+    With `force`, if these devices have none, use the newest one of any devices, even if edited by hand. `url` is the
+    address of the store. Raises `ConfigError`, which names the tools calibrated on these devices, if there is no
+    calibration.
     """
     store, warnings = Store(url), list[str]()
     results: list[StoredResult] = []
@@ -80,7 +80,7 @@ def calibration_of_tool(
 
 
 def _may_belong(result: StoredResult, arm: DeviceInfo, sensor: DeviceInfo) -> bool:
-    """Return whether the serial numbers of a stored result may belong to the devices."""
+    """Return whether a stored result may belong to the devices, according to the serial numbers."""
     pairs: Iterable[tuple[str | None, str]] = ((result.arm_serial, arm.serial), (result.sensor_serial, sensor.serial))
     return all(made == now or made in {None, NOT_REPORTED} or now == NOT_REPORTED for made, now in pairs)
 
@@ -108,7 +108,7 @@ def _of_sensor(
 
 
 def _failed(store: Store, result: StoredResult) -> Iterator[str]:
-    """Yield a warning if the last verification of a result has failed."""
+    """Yield a warning if the last verification of a result failed."""
     try:
         last = store.last_verification(result.id)
     except BadStore:

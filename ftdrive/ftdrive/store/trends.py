@@ -1,4 +1,4 @@
-"""Trends of bias and payload over the results of a tool, and dependence of a sensor's bias on temperature."""
+"""Trends of bias and payload over the results of a tool, and the dependence of a sensor's bias on temperature."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ SIGNIFICANT: Final = 0.01
 SHORTEST_DAYS: Final = 3.0
 
 _MONTH_DAYS = 30.0
-# Time between two runs from which the change of the bias in one hour is estimated, and smallest number of such pairs.
+# Time between two runs used to estimate the change of the bias in one hour, and the smallest number of such pairs.
 _NEAR_H: Final = (0.25, 6.0)
 _FEWEST_PAIRS: Final = 3
 # Median of the chi-squared distribution with one degree of freedom.
@@ -34,7 +34,7 @@ _VECTORS: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QuantityTrend:
-    """Linear trend of a quantity over the results of one tool on one sensor, arm and mount."""
+    """Linear trend of a quantity over the results for one tool on one sensor, arm and mount."""
 
     tool: str
     sensor_serial: str | None
@@ -73,7 +73,7 @@ class QuantityTrend:
 
 
 def trends_of(series: Sequence[StoredResult]) -> Iterator[QuantityTrend]:
-    """Yield the trends of results of one tool on one arm, sensor and mount, which are sorted by time."""
+    """Yield the trends of results for one tool on one arm, sensor and mount; the results are sorted by time."""
     for quantity, unit, rows in _quantities(series):
         days = {row[0] for row in rows}
         if len(days) < FEWEST_ESTIMATES or max(days) - min(days) < SHORTEST_DAYS:
@@ -84,9 +84,9 @@ def trends_of(series: Sequence[StoredResult]) -> Iterator[QuantityTrend]:
 
 
 def _quantities(series: Sequence[StoredResult]) -> Iterator[tuple[str, str, list[tuple[float, Array, Array]]]]:
-    """Yield each quantity with its unit, and (days, value, covariance) of the results that estimate it.
+    """Yield each quantity with its unit, and (days, value, covariance) for each result that estimates it.
 
-    A value equal to an earlier one was copied by an update; a value without variance was given as known.
+    Left out are values equal to an earlier one, which an update copied, and values given as known, without variance.
     """
     first = datetime.fromisoformat(str(series[0].created_utc))
     days = [(datetime.fromisoformat(str(result.created_utc)) - first).total_seconds() / 86400 for result in series]
@@ -110,7 +110,7 @@ def _estimated(
     return rows
 
 
-# Serial numbers of a sensor and its arm, and the mount.
+# Serial numbers of a sensor and of its arm, and the mount.
 Mounted = tuple[str, str | None, str | None]
 
 
@@ -125,7 +125,7 @@ class _Run(NamedTuple):
 def sensor_biases(
     results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]
 ) -> dict[Mounted, tuple[BiasTemperature | None, Array | None]]:
-    """Return the temperature dependence of each sensor's bias, and its change in one hour; None without enough data.
+    """Return the temperature dependence of each sensor's bias and its change in one hour, each None if data are few.
 
     The change is the standard deviation (6,), N and N·m, of a random walk, from at least three pairs of successive runs
     of one tool that are 15 min to 6 h apart. The estimate is a median over pairs and axes, separately for force and

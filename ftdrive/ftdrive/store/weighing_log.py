@@ -1,4 +1,4 @@
-"""Log of the weighings of a running program, in a file per day and in the store."""
+"""Log of a running program's weighings, in one file per day and in the store."""
 
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
@@ -16,22 +16,22 @@ from ftdrive.runs.weighings import FOLDER, WeighingDay, append_weighings
 
 # Time between two writes to the store, s.
 EVERY_S: Final = 30.0
-# Time-out of the last write at the end of a program, s; the store has a time-out of 5 s.
+# Time-out of the last write at the end of a program, s; that of the store is 5 s.
 _GOODBYE_S: Final = 6.0
-# Largest number of lines that wait for the disk; beyond it the oldest lines are lost.
+# Largest number of lines waiting for the disk; if there are more, the oldest are lost.
 _MOST_WAITING: Final = 1000
 _NOT_INDEXED: Final = "Weighings are saved, but not yet in the history"
-# A line of the log: its day and its content.
+# A line in the log: its day and its content.
 _Line = tuple[str, Mapping[str, JSON]]
 
 
 class WeighingLog:
-    """Log that writes in a separate thread, so that a slow disk or database never delays a stream.
+    """A log that writes in a separate thread, so that a slow disk or database never delays a stream.
 
-    A failed write is reported once, and repeated with the next write. `origin` has `tool`, `calibration_id`,
-    `arm_serial`, `sensor_serial`, `robot_host` and `emulated`; `url` is the address of the store. `say` receives a
-    sentence for the operator, from any thread. `folder` is by default in the user's data folder; `every_s` is the time
-    between two writes to the store, s.
+    A failed write is reported once, and its lines are written again with the next write. `origin` has `tool`,
+    `calibration_id`, `arm_serial`, `sensor_serial`, `robot_host` and `emulated`; `url` is the address of the store.
+    `say` receives a sentence for the operator, from any thread. `folder` is by default in the user's data folder;
+    `every_s` is the time between two writes to the store, s.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class WeighingLog:
         self._folder = folder or user_folder("data") / FOLDER
         self._lines = SimpleQueue[_Line | None]()
         self._waiting = list[_Line]()
-        # Day of the current file, its path, and its state when it was last read.
+        # Day and path of the current file, and its content when last read.
         self._day, self._path = "", Path()
         self._read: WeighingDay | None = None
         # Whether the file has lines that the store lacks.
@@ -61,7 +61,7 @@ class WeighingLog:
         self._thread.start()
 
     def keep(self, values: Mapping[str, JSON]) -> None:
-        """Log a weighing, as from `ftdrive.stream.weighing.load_values`, or the reason without one; return at once."""
+        """Log a weighing from `ftdrive.stream.weighing.load_values`, or why there is none; return at once."""
         t_utc = self._now().isoformat(timespec="milliseconds")
         self._lines.put((t_utc[:10], {"t_utc": t_utc, **values}))
 
@@ -96,7 +96,7 @@ class WeighingLog:
         return lines
 
     def _open(self) -> None:
-        """Open the store, before there is anything to write."""
+        """Open the store."""
         from ftdrive.store.store import Store
 
         self._store = Store(self._url)
@@ -117,11 +117,11 @@ class WeighingLog:
         self._attempt(_NOT_INDEXED, self._put_weighings)
 
     def _put_weighings(self) -> None:
-        # One row per file; one row per weighing would be 6 million per year and cell.
+        # The store gets one row per file, because one row per weighing would be 6 million per cell and year.
         if self._store is None:
             self._open()
         if self._lacks_older:
-            self._store.index(self._folder)  # files that an outage kept out of the store
+            self._store.index(self._folder)  # files that are missing from the store because of an outage
             self._lacks_older = False
         self._read = WeighingDay.load(self._path, self._read)
         self._store.put_weighings(self._read)
