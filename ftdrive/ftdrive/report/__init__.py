@@ -1,1 +1,1 @@
-"""The report of a calibration: facts, and their presentation as a page or as JSON."""
+"""The report on a calibration: facts, and their presentation as a page or as JSON."""

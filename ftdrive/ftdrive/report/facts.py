@@ -1,4 +1,4 @@
-"""All facts of a report as one JSON object, from which every format is written."""
+"""All facts in a report as one JSON object, from which every format is written."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -45,13 +45,13 @@ _LABELS = {
 
 
 def label_of(parameter: str) -> str:
-    """Return the name of an error coordinate or of its vector, such as "force bias x" for "force_bias_N.x"."""
+    """Return the label of an error coordinate or of its vector, such as "force bias x" for "force_bias_N.x"."""
     name, _, axis = parameter.partition(".")
     return f"{_LABELS[name]} {axis}".strip()
 
 
 def comparison_facts(result: CalibrationResult, before: CalibrationResult) -> dict[str, Any]:
-    """Return the comparison of a result with an earlier one from other data.
+    """Return the comparison of a result with an earlier one, usually from other data.
 
     `sensors` are the sources of the sensor errors, before and now. `parameters` have for each error coordinate its
     `name`, `change` (rad, N, m, N·m) and `sigmas`, null if exactly known in both. `groups` are tests. `same_data` means
@@ -77,15 +77,15 @@ def comparison_facts(result: CalibrationResult, before: CalibrationResult) -> di
     }
 
 
-# Forces at the tip for which sigma is drawn, N.
+# Forces at the tip for which the sigma is drawn, N.
 FORCES_N = np.arange(0.0, 101.0, 5.0)
 
 
 def contact_error(result: CalibrationResult) -> dict[str, Any]:
-    """Return the sigma of a force at the tip, as the norm of its error over all directions.
+    """Return the sigma of a force at the tip: the rms norm of its error over all directions.
 
     `tip_m` (3,) is relative to the sensor origin, sensor axes. Without known loads, the sigma `without_loads_N` (n,)
-    and the `tool` without sensor errors are null.
+    and the `tool` corrected for sensor errors are null.
     """
     without, tool = None, None
     if result.known_contact is not None:
@@ -142,10 +142,10 @@ _LONG = ("steps", "made_for", "description")
 def facts_of(subject: Subject, trust: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return the facts; sections without data are null.
 
-    The names contain the units: rad, m, N, N·m, s. `result` is the content of the calibration file, and `trust` its age
+    The names contain the units: rad, m, N, N·m, s. `result` is the content of the calibration file; `trust` is its age
     and last verification, from `ftdrive.report.subject`.
     """
-    # All formats are written from these facts, so that they agree.
+    # All formats are written from these facts, so they agree.
     result, dataset = subject.result, subject.dataset
     sweep = _planned_sweep(subject.run)
     R_base_flange = dataset.R_base_flange if dataset is not None else None if sweep is None else sweep.R_base_flange
@@ -206,7 +206,7 @@ def _about_of(result: CalibrationResult) -> str:
 
 def _correlation_facts(covariance: Array) -> dict[str, Any]:
     sigma = np.sqrt(np.diag(covariance))
-    sigma[sigma == 0] = np.inf  # exactly known parameters have no correlation
+    sigma[sigma == 0] = np.inf  # exactly known parameters have no correlations
     return {
         "names": list(PARAMETER_NAMES),
         "matrix": np.clip(covariance / np.outer(sigma, sigma), -1, 1).tolist(),
@@ -263,7 +263,7 @@ def _drift_facts(subject: Subject) -> dict[str, Any]:
 
 
 def _noise_facts(subject: Subject) -> dict[str, Any] | None:
-    """Return the standard error of the mean of one axis at each pose; None if it was not measured."""
+    """Return the standard error of the mean at each pose, for one axis; None if it was not measured."""
     if subject.dataset is None or subject.dataset.wrench_cov is None:
         return None
     variance = np.einsum("nii->ni", subject.dataset.wrench_cov)

@@ -1,4 +1,4 @@
-"""The figures of a report as SVG with the colours of the page, so that one file serves light and dark mode.
+"""The figures of a report as SVG in the colours of the page, so that one file serves light and dark mode.
 
 Matplotlib writes fixed colours. Each colour used here is replaced by a CSS variable afterwards.
 """
@@ -37,7 +37,7 @@ VARIABLES = {
 WIDTH_IN = 5.0
 # Durations above this, s, are shown in minutes.
 LONG_S = 200
-# Largest number of dots in a figure, because each dot enlarges the file; with more poses, every n-th is drawn.
+# Largest number of dots in a figure, because each dot enlarges the file; if there are more, every n-th is drawn.
 MOST_DOTS = 400
 # Correlations below this are not drawn.
 INVISIBLE = 0.02
@@ -69,7 +69,7 @@ def draw_figure(name: str, facts: Facts) -> str:
     height, (left, right, bottom, top), fill = _FIGURES[name]
     height_in = height(facts) if callable(height) else height
     with mpl.rc_context(dict(_STYLE)):
-        # Fixed margins, because an automatic layout takes as long as the drawing.
+        # Fixed margins, because an automatic layout would take as long as the drawing itself.
         figure = Figure(figsize=(WIDTH_IN, height_in))
         figure.subplots_adjust(left / WIDTH_IN, bottom / height_in, 1 - right / WIDTH_IN, 1 - top / height_in)
         fill(figure, facts)
@@ -79,7 +79,7 @@ def draw_figure(name: str, facts: Facts) -> str:
 
 
 def _inline_svg(svg: str, name: str) -> str:
-    """Return a matplotlib SVG file as an element of a page: unique ids, no prologue or size, variable colours."""
+    """Return a matplotlib SVG file as an element of a page: unique ids, variable colours, no prologue or size."""
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
     svg = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" aria-hidden="true">', svg, count=1)
     svg = re.sub(r'\bid="', f'id="{name}-', svg)
@@ -137,13 +137,13 @@ def _globe(axes: Any) -> Iterator[None]:
     box = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "edgecolor": "none"}
     for name, elevation, azimuth in (("+x", 0, 0), ("+y", 0, 90), ("-y", 0, -90), ("-x", 0, 180), ("-x", 0, -180)):
         x, y = _hammer_map(*np.radians([elevation, azimuth]))
-        axes.text(x, y - 0.2, name, ha="center", va="center", fontsize=8, bbox=box)  # below a pose at this place
+        axes.text(x, y - 0.2, name, ha="center", va="center", fontsize=8, bbox=box)  # below a pose that is drawn here
     axes.text(0, np.sqrt(2) + 0.08, "+z", ha="center", va="bottom", fontsize=8)
     axes.text(0, -np.sqrt(2) - 0.08, "-z", ha="center", va="top", fontsize=8)
 
 
 def _hammer_map(elevation: Any, azimuth: Any) -> tuple[Array, Array]:
-    """Return an equal-area map of the sphere (Hammer 1892) from angles in rad; +x in the middle, +z at the top."""
+    """Map angles on the sphere, rad, to the plane with equal areas (Hammer 1892); +x in the middle, +z at the top."""
     length = np.sqrt(1 + np.cos(elevation) * np.cos(azimuth / 2))
     x = 2 * np.sqrt(2) * np.cos(elevation) * np.sin(azimuth / 2) / length
     return np.asarray(x), np.asarray(np.sqrt(2) * np.sin(elevation) / length)
@@ -177,7 +177,7 @@ def _draw_correlation(figure: Any, facts: Facts) -> None:
     axes.spines[:].set_visible(False)
     seen = np.argwhere(matrix > INVISIBLE)
     corners = seen[:, None, ::-1] + [[0, 0], [1, 0], [1, 1], [0, 1]]
-    colours = [to_rgba(SERIES[0], matrix[i, j]) for i, j in seen]  # opacity shows the strength
+    colours = [to_rgba(SERIES[0], matrix[i, j]) for i, j in seen]  # the opacity shows the strength
     axes.add_collection(PolyCollection(list(corners), facecolors=colours, linewidth=0), autolim=False)
     for edge in range(0, n + 1, 3):
         axes.plot([0, n], [edge, edge], color=GRID, linewidth=0.8)
@@ -293,7 +293,7 @@ def _draw_comparison(figure: Any, facts: Facts) -> None:
 
 
 _Margins = tuple[float, float, float, float]
-# By name: height and margins (left, right, bottom, top) in inches, and the function that draws the figure.
+# For each figure: height and margins (left, right, bottom, top) in inches, and the function that draws it.
 _FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callable[[Any, Facts], None]]] = {
     "force_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "force_N", "mN")),
     "torque_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "torque_Nm", "mN·m")),

@@ -28,7 +28,7 @@ def render_page(facts: Facts) -> str:
 
 
 def templates(package: str, what: str, extra: str, instead: str) -> "Environment":
-    """Return the templates of a package, with escaping of every value.
+    """Return the templates of a package, in which every value is escaped.
 
     Raises
     ------

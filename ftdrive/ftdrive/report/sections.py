@@ -17,10 +17,10 @@ from ftdrive.words.result import SIGMA_OF_THE_TOOL, estimate_rows
 
 Facts = Mapping[str, Any]
 
-# Root mean square over the six channels that one good pose in 1000 exceeds, in sigmas.
+# Root mean square over the six channels, in sigmas, that one good pose in 1000 exceeds.
 SUSPICIOUS_SIGMAS = 1.9
 _AXES = "xyz"
-# A channel whose sigma is below this, N or N·m, has no drift.
+# A channel with a sigma below this, N or N·m, has no drift.
 _ROUNDING = 1e-9
 
 
@@ -42,7 +42,7 @@ class ReportTable:
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure by name, with a text alternative, and a caption that explains a good result."""
+    """The name of a figure, its text alternative, and its caption, which explains what a good result looks like."""
 
     name: str
     alt: str
@@ -51,7 +51,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A section with heading; `name` is its anchor."""
+    """A section with a heading; `name` is its anchor."""
 
     name: str
     title: str
@@ -71,12 +71,12 @@ def rounded(value: float | None, digits: int = 3) -> str:
 
 
 def capitalized(words: str) -> str:
-    """Return a text with a capital first letter."""
+    """Return a text with its first letter capitalized."""
     return words[:1].upper() + words[1:]
 
 
 def shown_poses(poses: Sequence[Any], most: int = 200) -> list[Any]:
-    """Return the poses to list and draw, in order: all, or the worst ones and evenly spread others."""
+    """Return the poses to list and draw, in order: all of them, or the worst ones and evenly spaced others."""
     if len(poses) <= most:
         return list(poses)
     size = np.array([pose["sigmas"] or pose["force_N"] for pose in poses])
@@ -230,7 +230,7 @@ def cross_validation(facts: Facts) -> Section:
 
 
 def residuals(facts: Facts) -> Section:
-    """Return the section with the residuals per pose and over time; for a motion, of its parts."""
+    """Return the section with the residuals per pose and over time; for a motion, those of its parts."""
     result, poses, in_motion = facts["result"], facts["poses"], facts["motion"] is not None
     text = [
         f"Residuals: {facts['residuals']}.",
@@ -282,7 +282,7 @@ def residuals(facts: Facts) -> Section:
 
 
 def drift(facts: Facts) -> Section:
-    """Return the section with the drift in the fit and of the repeated first pose."""
+    """Return the section with the drift that was fitted, and the change of the repeated first pose."""
     seen = facts["drift"]
     found, again = seen["in_fit"], seen["first_pose_again"]
     text = []
@@ -355,9 +355,9 @@ def coverage(facts: Facts) -> Section:
     return Section("coverage", title, text, [figure])
 
 
-# A difference exceeds this number of sigmas by chance once in 370.
+# One difference in 370 exceeds this number of sigmas by chance.
 LIMIT_SIGMAS = 3
-# Sigmas predicted by a plan: name with unit, factor to this unit, and key in plan and result.
+# Sigmas that a plan predicts: name with unit, factor to this unit, and key in the plan and the result.
 _PREDICTED = (
     ("mass, g", 1e3, "mass_kg"),
     ("centre of mass, mm", 1e3, "p_sensor_com_m"),
@@ -366,16 +366,16 @@ _PREDICTED = (
     ("force compensation, N", 1.0, "force_rms_N"),
     ("torque compensation, N·m", 1.0, "torque_rms_Nm"),
 )
-# A sigma larger than predicted by this factor is reported.
+# A sigma is reported if it exceeds the predicted one by more than this factor.
 _AS_PREDICTED = 1.2
 _AS_GOOD = "No sigma is more than 20 % larger than predicted."
 _WHY_LARGER = "Noise or errors of this sensor are larger than the plan assumed."
-# Significance of a difference between two results of one tool.
+# Significance level for a difference between two results of one tool.
 CHANGED_P = 1e-3
 
 
 def tour(facts: Facts) -> Section:
-    """Return the section with run, plan, devices and settings."""
+    """Return the section with the run, the plan, the devices and the settings."""
     run, title = facts["tour"], "Tour and settings"
     if run is None:
         return Section("tour", title, ["The source is not a run folder, so it contains no plan, devices or settings."])
@@ -483,7 +483,7 @@ def _last_verification(trust: Facts) -> Iterator[str]:
 
 
 def motion(facts: Facts) -> Section:
-    """Return the section with the parameters that only motion gives, and the planned sweep."""
+    """Return the section with the parameters that only a motion determines, and the planned sweep."""
     found = facts["motion"]
     sigma = found["sigma"]
     moments, of_moments = (np.array(values) for values in (found["inertia_kg_m2"], sigma["inertia_kg_m2"]))

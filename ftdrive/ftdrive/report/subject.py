@@ -1,4 +1,4 @@
-"""Subject of a report: a result, the data in its source, and whether these are unchanged."""
+"""Subject of a report: a result, and the data in its source."""
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
@@ -25,16 +25,16 @@ MAY_BE_MISSING = "a later verification may be missing, because {}"
 def trust_facts(
     result: CalibrationResult, source: Path, store_url: Callable[[], str | None], now: datetime
 ) -> dict[str, Any]:
-    """Return age and last verification of a result; an error of the store is in `store_error`.
+    """Return the age and the last verification of a result; `store_error` contains an error from the store.
 
     `source` is the file or run folder of the result. `store_url` reads `[store] url`; None means the user's store.
     """
-    # SQLAlchemy takes a quarter of a second to import, which help must not wait for.
+    # Importing SQLAlchemy takes a quarter of a second, for which a help text must not wait.
     from ftdrive.store.store import Store
 
     last, error = verification_near(source, result.id), ""
     try:
-        # The later verification in folder and store, because a store may be new and a folder may have moved.
+        # Take the later of the verifications in the folder and in the store: the store may be new, the folder moved.
         last = newest(filter(None, (last, Store(store_url()).last_verification(result.id))))
     except (BadStore, ConfigError) as unreadable:
         error = str(unreadable)
@@ -51,7 +51,7 @@ class Subject:
     source: Path
     result: CalibrationResult
     reproduce: str
-    """Command that reproduces the result; empty without data."""
+    """Command that reproduces the result; empty if there are no data."""
     dataset: CalibrationDataset | None = None
     run: Run | None = None
     records: Sequence[PoseRecord] = ()
@@ -63,9 +63,9 @@ class Subject:
 
 
 def read_subject(source: Path, options: SolveOptions, parent: Path | None = None) -> Subject:
-    """Read a calibration file, a run folder, a dataset.json or a CSV file; solve unsolved data.
+    """Read a calibration file, a run folder, a dataset.json or a CSV file; solve data that are not solved yet.
 
-    The saved result of a run folder is used if it belongs to the present poses and no option requires another one. A
+    The saved result of a run folder is used if it belongs to the current poses and no option requires a new one. A
     calibration file in a run folder is reported with the data of that run. The result is compared with `parent`, by
     default the parent named in the result. Raises `ConfigError`, `DataError`, `NotObservable` or `OSError`.
     """
@@ -80,7 +80,7 @@ def read_subject(source: Path, options: SolveOptions, parent: Path | None = None
 
 
 def _is_calibration(source: Path) -> bool:
-    """Whether a file is a calibration by its format; False if it is not JSON, which reading it as data reports."""
+    """Whether a file has the format of a calibration; False if it is not JSON (reported when read as data)."""
     if source.is_dir() or source.suffix != ".json":
         return False
     try:

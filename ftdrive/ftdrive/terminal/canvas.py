@@ -1,4 +1,4 @@
-"""Full-screen terminal display of text lines, drawn ten times per second; base of the `live` and `weigh` screens."""
+"""Full-screen display of text lines, drawn ten times per second; base of the `live` and `weigh` screens."""
 
 import os
 import select
@@ -31,7 +31,7 @@ _CHUNK = 256
 class Canvas(ABC):
     """A screen that covers the terminal until `q` or Ctrl-C.
 
-    The key `v` shows the `address` of the page in the browser as a QR code; it is empty without a page.
+    The key `v` shows the `address` of the browser page as a QR code; the address is empty if there is no page.
     """
 
     is_over = False
@@ -40,7 +40,7 @@ class Canvas(ABC):
     cover: Sequence[Line] = ()
     """Lines shown instead of the drawing until a key is pressed."""
     entry: tuple[Callable[[str], object], str, str] | None = None
-    """Function that receives the text typed in the last line, its hint, and the text so far."""
+    """A text field in the last line: the function that receives the text, the hint, and the text typed so far."""
 
     def __init__(self, address: str = "") -> None:
         self._address = address
@@ -57,10 +57,10 @@ class Canvas(ABC):
 
     @abstractmethod
     def act(self, key: str) -> None:
-        """Do the action of a key."""
+        """Perform the action of a key."""
 
     def page(self) -> Line | None:
-        """Return a line with the address of the page in the browser and its key; None without a page."""
+        """Return a line with the address of the browser page and the key `v`; None without a page."""
         return Line("─ ", FAINT).add(self._address).add("  v", STRONG).add(" QR code", FAINT) if self._address else None
 
     def lines(self, width: int, height: int) -> list[Line]:
@@ -100,12 +100,12 @@ class Canvas(ABC):
             self.act(key)
 
     def run(self, keys: TextIO | None = None, output: TextIO | None = None) -> None:
-        """Show the screen until `q` or Ctrl-C, then restore the terminal and print what stderr has received.
+        """Show the screen until `q` or Ctrl-C, then restore the terminal and print what stderr received meanwhile.
 
         Raises
         ------
         SupervisorGone
-            The terminal was closed. For SIGHUP and SIGTERM, the previous handlers raise.
+            The terminal was closed. After SIGHUP and SIGTERM, the previous handlers may raise other errors.
         """
         keys, output = keys or sys.stdin, output or sys.stderr
         supervisor = Supervisor(keys, output, "standard error")
@@ -146,9 +146,9 @@ class Canvas(ABC):
 
     @contextmanager
     def _signals_end_it(self) -> Iterator[None]:
-        """Let signals end the screen, because an exception in a handler could prevent the terminal's restoration.
+        """Let signals end the screen, because an exception in a handler could keep the terminal from being restored.
 
-        The signals are raised again afterwards, except for Ctrl-C, which ends the screen like `q`.
+        The signals are raised again afterwards, except for that of Ctrl-C, which ends the screen like `q`.
         """
         received = list[int]()
 
@@ -165,9 +165,9 @@ class Canvas(ABC):
             signal.raise_signal(number)
 
     def _changes(self, console: CommandConsole, fd: int) -> bytes:
-        """Return the bytes that draw the changed lines, or all lines after a change of the terminal's size."""
+        """Return the bytes that draw the changed lines, or all lines if the size of the terminal has changed."""
         size = os.get_terminal_size(fd)
-        # some terminals do not know their size
+        # some terminals report the size 0
         width, height = size.columns or 80, size.lines or 24
         lines = self.lines(width, height)
         with console.capture() as captured:
@@ -183,7 +183,7 @@ class Canvas(ABC):
 
 
 def _send(fd: int, rest: bytes) -> bytes:
-    """Send bytes that the terminal accepts until the next drawing is due; return the rest, so that keys do not wait."""
+    """Send the bytes that the terminal accepts until the next drawing is due; return the rest, to let keys be read."""
     due_s = time.monotonic() + REFRESH_S
     while rest and (left_s := due_s - time.monotonic()) > 0 and select.select([], [fd], [], left_s)[1]:
         rest = rest[os.write(fd, rest[:_CHUNK]) :]

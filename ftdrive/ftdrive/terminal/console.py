@@ -31,11 +31,11 @@ class CommandConsole(Console):
             yield one if one.control else Segment(visible(one.text), one.style)
 
     def on_broken_pipe(self) -> None:
-        """Leave the closed pipe to `ftdrive.cli.run`."""
+        """Leave the handling of a closed pipe to `ftdrive.cli.run`."""
         raise BrokenPipeError
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print with commands in the form to type."""
+        """Print, with commands written as they must be typed."""
         super().print(*(as_typed(one) if isinstance(one, str) else one for one in objects), **options)
 
     def print_next(self, *commands: str) -> None:
@@ -46,7 +46,7 @@ class CommandConsole(Console):
             self.print(self._next(command), soft_wrap=True)
 
     def _next(self, text: str) -> str:
-        r"""Return a command, folded with \ before its last option if it is too long, and the text after it."""
+        r"""Return a command and the text after it; a long command is folded with \ before its last option."""
         command, _, why = as_typed(text).partition("   ")
         shown = f"   {command}"
         if not self.soft_wrap and len(shown) > self.width:
@@ -56,11 +56,11 @@ class CommandConsole(Console):
 
 
 messages = CommandConsole(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
-"""Console on stderr: folds between words on a terminal, not in a file. Brackets and colons are kept, because paths
-contain them."""
+"""Console on stderr: folds lines between words on a terminal, but not in a file. Brackets and colons are printed as
+they are, because paths contain them."""
 
 answer = CommandConsole(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
-"""Console on stdout for results, verdicts and names of saved files. `-q` does not silence it; `--json` replaces it."""
+"""Console on stdout for results, verdicts and saved file names. `-q` does not silence it; `--json` replaces it."""
 
 
 def has_screen() -> bool:
@@ -75,7 +75,7 @@ def message_console(as_json: bool) -> CommandConsole:
 
 
 def print_address(words: str, address: str) -> None:
-    """Print an address after a text, or below it if the line is too short; never broken, and as a link if possible."""
+    """Print an address after a text, or below it if the line is too short; unbroken, and as a link if possible."""
     if not messages.soft_wrap and len(words + address) > messages.width >= len(f"   {address}"):
         words = f"{words.rstrip()}\n   "
     messages.print(Text.assemble(words, (address, Style(link=address))), soft_wrap=True)
@@ -91,7 +91,7 @@ def print_page(url: str, *, shared: bool) -> None:
 
 
 def qr_code(address: str) -> list[str]:
-    """Return the rows of the QR code of an address, light on dark; this needs the extra viz, like the page."""
+    """Return the rows of an address's QR code, light on dark; this needs the extra `viz`, as the page does."""
     import segno
 
     code = StringIO()
@@ -118,7 +118,7 @@ def indented(head: str | Text, words: str, console: Console = messages) -> Text:
 
 @contextmanager
 def working(words: str) -> Iterator[Callable[[str], None]]:
-    """Show on a terminal what a command is doing; a pipe gets one line after 2 s.
+    """Show on a terminal what a command is doing; a pipe gets a single line after 2 s.
 
     Yields a function that changes the text.
     """

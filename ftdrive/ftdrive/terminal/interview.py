@@ -32,14 +32,14 @@ class _Back(Exception):
 
 
 class Interview:
-    """Asks for missing answers in the terminal; `draft` is None with --yes, which uses the default answers."""
+    """Asks for missing answers in the terminal; with --yes, `draft` is None and the default answers are used."""
 
     def __init__(self, described: Description, draft: Path | None, again: str) -> None:
         self._described, self._draft, self._again = described, draft, again
         self._addresses: dict[str, str] = {}
 
     def take_draft(self, *, asked: bool) -> None:
-        """Use the answers saved in a draft; if `asked`, only after the user confirms."""
+        """Use the answers saved in a draft; with `asked`, only if the user confirms."""
         if self._draft is None or not self._draft.exists():
             return
         when = saved_at(self._draft)
@@ -53,7 +53,7 @@ class Interview:
             say(f"The answers of {when} are filled in from {self._draft}. Delete the file to start without them.")
 
     def take_options(self, given: dict[str, Any]) -> None:
-        """Use the answers given by options. Raises `ConfigError` for invalid ones."""
+        """Use the answers given as options. Raises `ConfigError` for invalid ones."""
         for question in QUESTIONS:
             if not (option := given.get(question.name)):
                 continue
@@ -73,7 +73,7 @@ class Interview:
         say(self._described.look(key, text), "  ✔ ")
 
     def run(self) -> None:
-        """Ask until everything is answered and the summary is confirmed."""
+        """Ask until all questions are answered and the summary is confirmed."""
         if self._draft is not None:
             say("Numbers may have a unit, such as 3.3 cm or 450 g. Enter 'back' for the previous question.")
         while True:
@@ -168,7 +168,7 @@ class Interview:
             text = None
 
     def _confirmed(self) -> bool:
-        """Show all answers; return whether to write them, False after a number that reopens a question.
+        """Show all answers; return whether to write them, or False if the user typed a number to reopen a question.
 
         Raises `_Back` to repeat the last question.
         """
@@ -191,7 +191,7 @@ class Interview:
         return not number
 
     def _ask(self, question: CellQuestion, words: str, usual: str | None) -> str:
-        """Return a valid answer, "" for no more rows; Enter and --yes use the default `usual`."""
+        """Return a valid answer; "" means no more rows. Enter and --yes use the default `usual`."""
 
         def accept(text: str) -> None:
             if question.repeats and not text:
@@ -246,5 +246,5 @@ def _yes_or_no(answer: str) -> None:
 
 
 def say(words: str, head: str = "") -> None:
-    """Print on stderr; further lines are indented to the first word after the head."""
+    """Print on stderr; lines after the first are indented to the first word after the head."""
     messages.print(indented(head, words), soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Single keys from a terminal, without Enter. Ctrl-C still interrupts; all other keys only reach the screen."""
+"""Single keys from a terminal, without Enter. Ctrl-C still interrupts; all other keys reach only the screen."""
 
 import atexit
 import codecs
@@ -20,17 +20,17 @@ _STROKE = re.compile(f"{_ESCAPE.pattern}|[^\x1b]")
 _NAMES = {"\x1b": "escape", "\n": "enter", "\r": "enter", "\x7f": "backspace", "\b": "backspace"}
 _NAMES |= {f"\x1b{mode}{letter}": name for mode in "[O" for letter, name in (("C", "right"), ("D", "left"))}
 _KEYS = {key.value: key for key in Key}
-# A letter within this time of another letter belongs to a word, such as a late answer, s.
+# A letter typed within this time of another one belongs to a word, such as a late answer, s.
 _WORD_S = 0.3
-# Keys that are obeyed even within a word, because an unnecessary stop is harmless; others become `Key.OTHER`.
+# Keys that take effect even within a word, because an unnecessary stop is harmless; others become `Key.OTHER`.
 _ALWAYS = {Key.PAUSE, Key.STOP}
 
 
 class Keyboard:
     """Keys of a terminal, read by a thread. The terminal settings are restored on every exit from the context.
 
-    A session reads requests (`pressed`), which exclude letters of words. Other screens read each keystroke (`stroke`).
-    `fd` is the descriptor of a terminal, see `usable`.
+    A session reads requests (`pressed`), which exclude letters within words. Other screens read each keystroke
+    (`stroke`). `fd` is the descriptor of a terminal; see `usable`.
     """
 
     def __init__(self, fd: int) -> None:
@@ -43,9 +43,9 @@ class Keyboard:
 
     @staticmethod
     def usable(fd: int) -> bool:
-        """Whether the keys of a descriptor can be read: a terminal in the foreground, not a pipe or a background job.
+        """Whether keys can be read from a descriptor: a terminal in the foreground, not a pipe or a background job.
 
-        False on Windows, which has no `termios`.
+        False on Windows, which lacks `termios`.
         """
         if not hasattr(os, "tcgetpgrp"):
             return False
@@ -66,7 +66,7 @@ class Keyboard:
         return self._keys.popleft() if self._keys else None
 
     def stroke(self) -> str | None:
-        """Return the oldest unread keystroke, a character or a name such as "left"; None if there is none."""
+        """Return the oldest unread keystroke, as a character or a name such as "left"; None if there is none."""
         return self._strokes.popleft() if self._strokes else None
 
     @property
@@ -107,7 +107,7 @@ class Keyboard:
     def _stop(self) -> None:
         thread, self._thread = self._thread, None
         if thread is not None:
-            # the thread ends before the terminal discards typed input: reading a discarded key would never return
+            # end the thread before the terminal discards typed input: reading a discarded key would never return
             os.close(self._wake)
             thread.join()
         self._restore()
@@ -119,9 +119,9 @@ class Keyboard:
             return
         import termios
 
-        # a closed terminal needs no restoration
+        # a closed terminal need not be restored
         with suppress(termios.error):
-            # at once, because draining would wait for Ctrl-Q after Ctrl-S
+            # now, because TCSADRAIN would wait for Ctrl-Q after Ctrl-S
             termios.tcsetattr(self._fd, termios.TCSANOW, self._before)
             termios.tcflush(self._fd, termios.TCIFLUSH)
         self._before = None
@@ -129,7 +129,7 @@ class Keyboard:
 
     def _read(self, wake: int) -> None:
         word, typed_s = "", 0.0
-        # a character can arrive in two parts
+        # the bytes of a character can arrive in two parts
         decoder = codecs.getincrementaldecoder("utf-8")("replace")
         try:
             while True:

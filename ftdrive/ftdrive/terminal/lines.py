@@ -1,4 +1,4 @@
-"""Lines of styled text, and plots of Braille characters."""
+"""Lines of styled text, and plots made of Braille characters."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -52,7 +52,7 @@ class Line:
         return self
 
     def fit(self, width: int) -> "Line":
-        """Return this line padded to `width` cells, or as many whole words as fit with an ellipsis."""
+        """Return this line padded to `width` cells, or as many of its words as fit before an ellipsis."""
         if self.width <= width:
             return self.to(width)
         fitted = Line()
@@ -77,7 +77,7 @@ class Line:
         return line
 
     def as_text(self) -> Text:
-        """Return this line as a text of rich."""
+        """Return this line as a rich `Text`."""
         return Text.assemble(*self.parts, no_wrap=True)
 
     def __str__(self) -> str:
@@ -93,8 +93,8 @@ _BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.ui
 def envelope(low: Array, high: Array, rows: int, full: float) -> Dots:
     """Return dots (4 rows, n) for the ranges from `low` to `high` (n,), without gaps between neighbours.
 
-    A column with NaN stays empty. The upper edge is `full`, the lower edge -`full`; larger values are drawn at the
-    edge.
+    A column with NaN stays empty. The upper edge is `full`, the lower edge -`full`; values beyond an edge are drawn at
+    the edge.
     """
     low, high = low.copy(), high.copy()
     joined = np.isfinite(low[1:]) & np.isfinite(low[:-1])
@@ -118,7 +118,7 @@ def characters(dots: Dots) -> NDArray[np.str_]:
 def plot(
     low: Array, high: Array, rows: int, full: float, in_contact: NDArray[np.bool_], under: Dots | None = None
 ) -> list[Line]:
-    """Return an `envelope` as lines of n / 2 characters, over the dots `under`; contacts have their own colour."""
+    """Return an `envelope` as lines of n / 2 characters, above the dots `under`; contacts have their own colour."""
     ink = characters(envelope(low, high, rows, full))
     drawn, cells = ink != " ", ink if under is None else np.where(ink != " ", ink, characters(under))
     styles = np.where(drawn, np.where(in_contact, CONTACT, TRACE), FAINT)
@@ -126,5 +126,5 @@ def plot(
 
 
 def _dot(value: Array, rows: int, full: float) -> Array:
-    """Return the rows of dots for values, 0 at the top; values near zero are in the row below the middle."""
+    """Return the dot row of each value, 0 at the top; values near zero are in the row below the middle."""
     return np.floor((1 - value / full) * 2 * rows + 0.5)

@@ -21,12 +21,12 @@ from ftdrive.words import stream as words
 from ftdrive.words.stream import ShownWrench, View
 from ftdrivers.interfaces import Array
 
-# Width of the numbers in the table.
+# Width of the numbers in the table, in cells.
 _NUMBERS = 37
 _ARROWS = "→↗↑↖←↙↓↘"
 # Number of the first stage that applies to a sensor alone.
 _LOWPASS = 4
-# Width of a hemisphere.
+# Width of a hemisphere, in cells.
 _DISC = 16
 _STATE = {"ok": ("✔", GOOD), "warning": ("!", WARNING), "failed": ("✘", BAD), "skipped": ("-", FAINT)}
 _TONES = {"good": GOOD, "warning": WARNING, "bad": BAD}
@@ -40,7 +40,7 @@ _NOTES |= dict.fromkeys(("tare-refused", "gap", "stale", "failed"), BAD)
 
 
 def head_lines(view: View, width: int, page: Line | None = None) -> list[Line]:
-    """Return the lines with devices, stages, calibration, and the device without samples or the page in the browser."""
+    """Return the lines with devices, stages, calibration, and the device without samples or the browser page."""
     rule = Line() if page is None else page.add(" ")
     rule.add("─" * (width - rule.width), FAINT)
     if view.silent:
@@ -139,13 +139,13 @@ def format_component(reading: ShownWrench, i: int) -> tuple[str, str]:
 
 
 def _decimals(reading: ShownWrench | None, first: int) -> int:
-    """Return the number of decimals that shows the sigmas of three components without contact."""
+    """Return the number of decimals that can show the sigmas of three components without contact."""
     usual = 3 if first else 2
     return usual if reading is None or not reading.rest_sigma[first : first + 3].max() < 0.5 * 10**-usual else usual + 1
 
 
 def _component_row(view: View, name: str, now: tuple[str, str], peaks: str) -> Line:
-    """Return a line with name, present value, sigma and extremes; an old value is not shown as current."""
+    """Return a line with name, current value, sigma and extremes; an old value is not shown as current."""
     line = Line(name, STRONG)
     if view.live is None:
         return line.add(f"{'--.--':>8}", BAD if view.silent else FAINT).add(f"{'--':>8}", FAINT).add(peaks)
@@ -161,7 +161,7 @@ def _at_rest(view: View) -> Line:
 
 
 def _digits(sigma: float, places: int) -> str:
-    """Return a standard deviation with fixed decimals, so that columns stay aligned; "--" if NaN."""
+    """Return a standard deviation with a fixed number of decimals, so that columns stay aligned; "--" if NaN."""
     return "--" if np.isnan(sigma) else f"{sigma:.{places}f}"
 
 
@@ -206,7 +206,7 @@ def _contact_line(view: View) -> Line:
 
 
 def links(view: View) -> list[Line]:
-    """Return lines with the direction of gravity in tool axes, raw wrench, used range, links and payload."""
+    """Return lines with the direction of gravity in tool axes, raw wrench, share of range, links and payload."""
     if view.info.is_raw:
         return [_raw(view), _range(view), _link_line(view, "sensor", view.status.sensor)]
     dial = [""] * 5
@@ -267,7 +267,7 @@ def _check_line(check: Check) -> Line:
 
 
 def other_wrench_lines(view: View) -> list[Line]:
-    """Return lines with the wrench after fewer stages, and in other frames."""
+    """Return lines with the wrench after fewer stages and in other frames."""
     if view.reading is None or not (rows := words.other_wrenches(view)):
         return []
     lines = [Line(f" in {words.short_frame(view.reading.frame)}", FAINT).to(21)]
@@ -285,7 +285,7 @@ def other_wrench_lines(view: View) -> list[Line]:
 
 
 def sphere(view: View) -> list[Line]:
-    """Return a drawing of gravity in flange axes on two hemispheres, with calibrated orientations and sigma."""
+    """Draw gravity in flange axes on two hemispheres, with the calibrated orientations and the sigma."""
     reading = view.reading
     if reading is None or view.info.is_raw:
         return []
@@ -308,7 +308,7 @@ def sphere(view: View) -> list[Line]:
 
 
 def _half_sphere(known: Array, down: Array) -> list[Line]:
-    """Draw one hemisphere, seen along z, with directions (n, 3); the distance from the centre is the angle."""
+    """Draw one hemisphere, seen along z, with directions (n, 3); the distance from the centre shows the angle."""
     rows, angle = _DISC // 2, np.linspace(0, 2 * np.pi, 200)
     dots = np.zeros((4 * rows, 2 * _DISC), np.bool_)
     for radius in (0.5, 1.0):
@@ -326,7 +326,7 @@ def _half_sphere(known: Array, down: Array) -> list[Line]:
 
 
 def identity(view: View, width: int) -> list[Line]:
-    """Return lines with devices and serial numbers, calibration, and the checks shared with `doctor`."""
+    """Return lines with devices and serial numbers, the calibration, and the checks shared with `doctor`."""
     info = view.info
     lines = [Line(" sensor    ", FAINT).add(who(info.sensor))]
     if not info.is_raw:
@@ -342,7 +342,7 @@ def identity(view: View, width: int) -> list[Line]:
 
 
 def events(view: View, width: int, rows: int) -> list[Line]:
-    """Return lines with the newest events first; with few lines, several events per line."""
+    """Return lines with the newest events first; if `rows` is small, several events share a line."""
     lines = list[Line]()
     for note in view.notes:
         if len(lines) > rows:
@@ -356,7 +356,7 @@ def events(view: View, width: int, rows: int) -> list[Line]:
 
 
 def newest_rows(view: View, width: int) -> int:
-    """Return the number of lines of the newest event."""
+    """Return the number of lines that the newest event takes."""
     return next((len(_event_lines(view, note, width)) for note in view.notes), 0)
 
 
@@ -380,7 +380,7 @@ def _hanging(head: Line, parts: Sequence[Part], width: int) -> list[Line]:
 
 
 def keys(view: View, width: int) -> Line:
-    """Return a line with the keys."""
+    """Return a line that lists the keys."""
     names = ["t tare", "u undo", "x axes", "a about", "1-4 stage", "z freeze", "b mark", "r rec", "p peak", "g span"]
     if view.info.is_raw:
         names = ["t tare", "u undo", "4 low-pass", "z freeze", "b mark", "r rec", "p peak", "g span"]
@@ -399,10 +399,10 @@ def keys(view: View, width: int) -> Line:
 
 
 def show_table(views: Iterable[View]) -> None:
-    """Show a table of each view, without keys and events, until the views or the operator end it."""
+    """Show each view as a table, without keys and events, until the views end or the operator stops."""
     shown = Group()
     with (
-        # the echo of Enter would break the screen
+        # an echoed Enter would break the screen
         Keyboard(0) if Keyboard.usable(0) else nullcontext(),
         Live(console=answer, refresh_per_second=10) as screen,
     ):

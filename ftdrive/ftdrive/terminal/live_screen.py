@@ -50,9 +50,9 @@ _HELP = """\
 
 
 def run_live(feed: Feed, checks: Sequence[Check] = (), address: str = "") -> None:
-    """Read and show the open stream of a feed until the user quits; `checks` are findings from outside the stream.
+    """Read and show the open stream of a feed until the user quits; `checks` are findings not based on the stream.
 
-    `address` is the address of the page in the browser, or empty. Raises `DeviceError` if the stream had failed when
+    `address` is the address of the browser page, or empty. Raises `DeviceError` if the stream had failed when
     the user quit, and `SupervisorGone` if the terminal was closed.
     """
     info = feed.stream.info
@@ -78,7 +78,7 @@ class LiveScreen(Canvas):
         self._feed, self._summary = feed, summary
 
     def draw(self, width: int, height: int) -> list[Line]:
-        """Draw the present state."""
+        """Draw the current state."""
         return draw_live(self._summary.view(), width, height, self.page())
 
     def turns(self) -> Iterator[object]:
@@ -86,7 +86,7 @@ class LiveScreen(Canvas):
         return self._feed.turns(until=lambda: self.is_over)
 
     def act(self, key: str) -> None:
-        """Do the action of a key."""
+        """Perform the action of a key."""
         if key == "?":
             self.cover = [Line(text) for text in _HELP.split("\n")]
         elif key == "z":
@@ -131,10 +131,10 @@ def _actions(feed: Feed) -> dict[str, Callable[[], object]]:
     return found
 
 
-# From this width on, the plots are drawn to the right of the table.
+# At this width or more, the plots are drawn to the right of the table.
 _WIDE = 120
 _LEFT = 78
-# Width of the scale of a plot.
+# Width of a plot's scale, in cells.
 _GUTTER = 7
 _LEAST_PLOT_ROWS, _LEAST_EVENTS = 3, 3
 
@@ -155,7 +155,7 @@ def _narrow_layout(view: View, width: int, rows: int) -> list[Line]:
         plot_rows = min(7, (rows - len(body) - 10) // 3)
         body += _plots(view, width, 3 * plot_rows, across=2)
     links = [separator, *live_panels.links(view)]
-    # leave room for a whole refusal
+    # leave room for the whole newest event, such as a refused tare
     if rows - len(body) - len(links) - 1 >= max(1, live_panels.newest_rows(view, width)):
         body += links
     if rows - len(body) >= 20:
@@ -182,7 +182,7 @@ def _wide_lines(view: View, width: int, rows: int) -> list[Line]:
 
 
 def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
-    """Return all six plots in `rows` lines, the last of which is the time axis."""
+    """Return all six plots in `rows` lines; the last line is the time axis."""
     each, cells = (rows - 1) // (6 // across), width // across - _GUTTER - 1
     if each < 2 or cells < 8:
         return []
@@ -202,9 +202,9 @@ def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
 
 
 def _plot_lines(view: View, columns: PlotColumns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
-    """Return the plot of one component: a line with contacts, marks and optional value, then lines of Braille.
+    """Return the plot of one component: a line with contacts, marks and an optional value, then lines of Braille.
 
-    The envelope of the samples is drawn over the zero line and its band of ±1 sigma of a sample.
+    The envelope of the samples is drawn over the zero line and the band of ±1 sigma of a single sample.
     """
     reading, unit = view.reading, "N" if i < 3 else "N·m"
     head = Line(f"{AXES[i]:>{_GUTTER - 1}} ", STRONG)

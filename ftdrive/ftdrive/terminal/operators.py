@@ -14,12 +14,12 @@ from ftdrive.terminal.text import in_whole_words
 from ftdrive.words.session import SessionText
 from ftdrive.words.text import TextLine, visible
 
-# Letters and words with one meaning in every question; s and r never mean a word that moves an arm.
+# Letters and words that mean the same in every question; s and r never stand for a word that moves an arm.
 _SAME: Final = {"y": "yes", "n": "no", "q": "quit", "quit": "q", "skip": "s", "redo": "r"}
 
 
 def match_answer(question: Question, typed: str) -> str | None:
-    """Return the answer that was typed; None if it is not an answer.
+    """Return the answer that was typed; None if the text is not an answer.
 
     If a word must be typed exactly, "no" raises `Declined`.
     """
@@ -35,14 +35,14 @@ def match_answer(question: Question, typed: str) -> str | None:
 
 
 def prompt(question: Question) -> str:
-    """Return the question, followed by the possible answers unless its text contains them."""
+    """Return the question, followed by the possible answers unless the text already contains them."""
     if len(question.answers) == 1 and question.answers[0] in question.text:
         return f"{question.text}: "
     return f"{question.text} [{'/'.join(answer or 'Enter' for answer in question.answers)}] "
 
 
 def not_an_answer(question: Question, typed: str) -> str:
-    """Return why a line is not an answer, and what to type; a key never means a word that moves an arm."""
+    """Return why a line is not an answer, and what to type; a single key never stands for a word that moves an arm."""
     word = typed.strip()
     named = [answer for answer in question.answers if answer]
     if len(question.answers) == 1 and word.lower() == named[0].lower():
@@ -76,7 +76,7 @@ class JsonOperator(_Keyless):
     """Writes one JSON object per line to stdout for every event and question; answers come from stdin.
 
     A question is the object `{"event": "question", "text", "answers", "error"}`. The next line of stdin is its answer.
-    `error` is the reason why the previous line was rejected, or null.
+    `error` is the reason for rejecting the previous line, or null.
     """
 
     def __init__(self, *, stdin: TextIO | None = None, stdout: TextIO | None = None) -> None:
@@ -89,7 +89,7 @@ class JsonOperator(_Keyless):
         self._write(event.to_dict())
 
     def ask(self, question: Question) -> str:
-        """Return the answer from stdin. Raises `Declined` at its end."""
+        """Return the answer read from stdin. Raises `Declined` at the end of stdin."""
         self.supervisor.expect_answer()
         error = None
         while True:
@@ -115,9 +115,9 @@ class JsonOperator(_Keyless):
 
 
 class PlainOperator(_Keyless):
-    """Plain lines on stderr, without colour and without keys; `verbose` as for `SessionText`.
+    """Plain lines on stderr, without colours or keys; `verbose` is that of `SessionText`.
 
-    With `quiet`, lines are only printed before a question that may refer to them.
+    With `quiet`, lines are printed only before a question that may refer to them.
     """
 
     def __init__(
@@ -133,24 +133,24 @@ class PlainOperator(_Keyless):
     def show(self, event: Event) -> None:
         """Write the lines of the event."""
         if isinstance(event, Asked) and event.question == self._asked:
-            # question and answer are printed already
+            # the question and the answer are already printed
             return
         self._write_lines(self._text.lines(event))
 
     def ask(self, question: Question) -> str:
-        """Return the answer from stdin, ignoring input before the question. Raises `Declined` at its end."""
+        """Return the answer from stdin, ignoring earlier input of a terminal. Raises `Declined` at the end of stdin."""
         self.supervisor.expect_answer()
         self._asked = question.text
         self.finish()
         quiet, self._quiet, withheld, self._withheld = self._quiet, False, self._withheld, []
         self._write_lines(withheld)
         self._quiet = quiet
-        # Input typed before the question could confirm a motion that was not shown yet.
+        # Input typed before the question might confirm a motion that had not been shown yet.
         if self._stdin.isatty():
             # Windows cannot discard early input, so no answer is read there
             import termios
 
-            # for a closed terminal, reading raises the error
+            # if the terminal is closed, reading raises the error
             with suppress(termios.error):
                 termios.tcflush(self._stdin.fileno(), termios.TCIFLUSH)
         while True:
@@ -158,7 +158,7 @@ class PlainOperator(_Keyless):
             try:
                 typed = read_answer(self.supervisor, question)
             except (KeyboardInterrupt, Declined):
-                # the next message begins on a new line
+                # start a new line for the next message
                 self._write("\n")
                 raise
             if not self._stdin.isatty():
@@ -168,7 +168,7 @@ class PlainOperator(_Keyless):
             self._write(not_an_answer(question, typed) + "\n")
 
     def finish(self) -> None:
-        """Write the line of passed checks that waits for further ones."""
+        """Write the pending line of passed checks, which is waiting for further ones."""
         self._write_lines(self._text.pending())
 
     def _write_lines(self, lines: Sequence[TextLine]) -> None:

@@ -1,4 +1,4 @@
-"""Printed tables of results and verifications."""
+"""Printed tables for results and verifications."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ from ftdrivers.interfaces import Array
 
 _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
 _NO_LIMIT = 10_000
-# Rows whose values follow from mass and tilt.
+# Rows whose values follow from the mass and the tilt.
 _DERIVED = {"gravity_force_base_N"}
 
 
@@ -40,16 +40,16 @@ def print_result(
     ----------
     result : CalibrationResult
     truth : mapping, optional
-        True values with the keys of the result; they and the errors are printed next to the estimates.
+        True values by the keys of the result; they and the errors are printed next to the estimates.
     drift : DriftCheck, optional
     records : sequence of PoseRecord
-        Records of the dataset, for the names of poses and the explanation of bad fits.
+        Records of the dataset, to name the poses and explain bad fits.
     hinted : bool
-        Print hints on what to check in the cell.
+        Print hints about what to check in the cell.
     saved : Path, optional
         Name of the calibration file, printed in the last line.
     every : bool
-        Print everything: all findings, residuals, contents of sigma. `-v` implies this.
+        Print everything: all findings, the residuals, what sigma includes. `-v` implies this.
     """
     every |= messages.verbose
     amount = f"{result.n_poses} poses" if result.motion is None else f"{100 * result.motion.used_share:.0f} % used"
@@ -73,7 +73,7 @@ def _result_table(result: CalibrationResult, truth: Mapping[str, Any] | None, *,
     table = Table(box=None, padding=(0, 1))
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
-            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # only names are folded
+            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # fold only the names
     for key, axis, *texts in estimate_rows(data, truth):
         if key in _DERIVED and not every:
             continue
@@ -102,10 +102,10 @@ def print_comparison(compared: Sequence[MethodResult]) -> None:
 
 
 def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], MethodResult]], heading: str) -> None:
-    """Print Yu's Table III: the largest errors on a test set, and the errors of weight and centre of mass.
+    """Print Yu's Table III: the largest errors on a test set, and the errors of the weight and the centre of mass.
 
-    `titles` head the first columns: the method, or case, method and sets. `heading` names the test set and the
-    reference.
+    `titles` are the headings of the first columns: the method, or case, method and sets. `heading` names the test set
+    and the reference.
     """
     answer.print(indented(" ", heading, answer))
     table = Table(box=None, padding=(0, 0, 0, 1), pad_edge=True)
@@ -122,7 +122,7 @@ def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], Metho
 
 
 def print_cases(cases: Sequence[tuple[int, str, str, MethodResult]], *, known: bool) -> None:
-    """Print Yu's Table III; `known` is true if the errors of weight and centre are known from an emulated cell."""
+    """Print Yu's Table III; `known` is true if an emulated cell gives the errors of weight and centre of mass."""
     reference = "the truth of the emulated cell" if known else "ml with all poses but those of D"
     heading = f"Table III of Yu et al. 2021: largest errors on the test set; mg and centre against {reference}:"
     every = max((data for _, data, _, _ in cases), key=len)
@@ -161,7 +161,7 @@ def _comparison_table(compared: Sequence[MethodResult], *, vectors: bool) -> Tab
 
 
 def print_verification(verified: Verified) -> None:
-    """Print measured and predicted wrench per pose, the verdict with its limits, the changes, and the file."""
+    """Print the measured and predicted wrench per pose, the verdict with its limits, the changes, and the file name."""
     count = counted(len(verified.records), "pose")
     answer.print(Text.assemble(("Verification", "bold cyan"), f"  {count}, calibration {verified.calibration.id[:6]}"))
     for mark in verified.marks:

@@ -65,7 +65,7 @@ _NARROWEST_BAR = 8
 def draw_session(view: SessionView, now_s: float, *, width: int = 80, height: int = 24) -> Group:
     """Return the screen, at most `width` wide and `height` high, with one line left for the cursor.
 
-    If there is not enough room, blocks are omitted, highest rank first. Blocks of rank 0 stay.
+    If there is not enough room, blocks are omitted, those of the highest rank first. Blocks of rank 0 stay.
     """
     wide = width >= _TABLE_WIDTH + 1 + _CUBE_WIDTH
     blocks: list[tuple[int, list[Text]]] = [
@@ -175,7 +175,7 @@ def _estimate_text(fit: Estimated | None, label: str, factor: float, name: str) 
 
 
 def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
-    """Return the unfolded cube of the flange axes, with the number of poses that had gravity along each."""
+    """Return the unfolded cube of the flange axes, with the number of poses in which gravity was along each."""
     face = None
     if newest is not None:
         axis = int(np.abs(newest).argmax())
@@ -210,7 +210,7 @@ def _keys(view: SessionView) -> list[Text]:
     # keys are only read between the first and the last pose
     useful: set[Key] = set()
     if view.now is not None and view.now.stop is not None:
-        # by hand, the number of poses is open
+        # in hand guiding, the number of poses is open
         useful = set(KEYS) if view.now.stops is None else set(KEYS) - {Key.KEEP}
     line = Text()
     for key, word in KEYS.items():
@@ -239,15 +239,15 @@ def _folded(view: SessionView, text: str, width: int, style: str = "") -> list[T
 
 
 def _end_of(text: str, width: int) -> str:
-    """Shorten a path at its beginning, because its end distinguishes runs."""
+    """Shorten a path at its beginning, because runs differ at its end."""
     return text if len(text) <= width else "…" + text[len(text) - width + 1 :]
 
 
 class Screen:
     """An operator at a terminal: messages scroll above a frame, and questions appear below it.
 
-    Without a keyboard there are no keys, and questions are answered by lines. If verbose, each check, the table of the
-    plan and each pose appear above the frame. `command` is the task, "calibrate" or "verify".
+    Without a keyboard there are no keys, and whole lines answer the questions. With `verbose`, each check, the table of
+    the plan and each pose appear above the frame. `command` is the task, "calibrate" or "verify".
     """
 
     pressed_by = "the operator"
@@ -285,7 +285,7 @@ class Screen:
         gone = suppress(OSError) if self.supervisor.absence() else nullcontext()
         with gone, self._stack:
             self._print(self._text.pending())
-            # after an error, the frame stays, because it contains the command to resume
+            # after an error, keep the frame, because it contains the command to resume
             self._live.transient = kind is None
             self._live.stop()
         if kind is None and self._view.folder:
@@ -338,7 +338,7 @@ class Screen:
         return Live(console=self._console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
 
     def _answer(self, question: Question) -> str:
-        """Ask until there is an answer, then erase the question and the frame, so the next frame takes their place."""
+        """Ask until there is an answer, then erase the question and the frame to make room for the next frame."""
         used = len(self._frame().renderables)
         while True:
             width = self._console.width
@@ -349,7 +349,7 @@ class Screen:
             try:
                 typed = read_answer(self.supervisor, question)
             except (KeyboardInterrupt, Declined):
-                # the next message begins on a new line
+                # start a new line for the next message
                 self._console.file.write("\n")
                 raise
             used += len(lines) + (last.cell_len + 1 + cell_len(typed.rstrip("\n"))) // width + 1
@@ -382,7 +382,7 @@ def _history(event: Event, view: SessionView) -> bool:
 
 @contextmanager
 def open_operator(*, as_json: bool = False, command: str = "calibrate", live: bool = True) -> Iterator[Operator]:
-    """Return the operator for a task: JSON on request, a live screen on a terminal, else plain lines.
+    """Yield the operator for a task: JSON on request, a live screen on a terminal, else plain lines.
 
     The screen is drawn on stderr. A dumb terminal, `-q` and tasks without `live` get plain lines.
     """

@@ -1,4 +1,4 @@
-"""Check whether an operator, or a program in their place, still follows a session through its streams and terminal."""
+"""Checks, on a session's streams and terminal, whether an operator or a program in their place still follows it."""
 
 import os
 import select
@@ -15,11 +15,11 @@ _LOOK_MS: Final = 50
 
 
 class Supervisor:
-    """The other ends of the streams of a session. Only `read_line` reads, and never beyond its line.
+    """Watches the other ends of a session's streams. Only `read_line` reads, and never beyond its line.
 
     Inside a `with` block, a hang-up of the terminal (SIGHUP) is detected too, unless it is ignored, as with `nohup`.
     The end of the input counts only if its writer was connected when a question was asked, because prepared answers may
-    end before. `name` is the name of the output in messages.
+    end before. `name` is what messages call the output.
     """
 
     def __init__(self, stdin: TextIO, output: IO[str], name: str) -> None:
@@ -58,7 +58,7 @@ class Supervisor:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Raise `SupervisorGone` for an error of the block if the output has lost its reader."""
+        """Raise `SupervisorGone` in place of an error in the block if the output has lost its reader."""
         try:
             yield
         except OSError as error:
@@ -67,18 +67,18 @@ class Supervisor:
             raise
 
     def expect_answer(self) -> None:
-        """Record whether a writer of answers is connected; call it before a question is shown."""
+        """Record whether the writer of the answers is connected; call this before a question is shown."""
         if self._input is not None and self._input not in self._terminals:
             self._answers |= hasattr(select, "poll") and not _is_closed(self._input, reading=True)
 
     def read_line(self, unanswered: str) -> str:
-        """Read one line. Raises `SupervisorGone`, or `Declined` with `unanswered` at the end of the input."""
+        """Read one line. Raises `SupervisorGone`, or at the end of the input `Declined` with the text `unanswered`."""
         fd = self._input
         if fd is None or not hasattr(select, "poll"):
             line = self._stdin.readline()
         else:
             self.expect_answer()
-            # Byte by byte, so that nothing after the line is read, and the end of the input is detected.
+            # Read byte by byte, so that nothing after the line is read and the end of the input is detected.
             line = self._read_bytes(fd).decode(self._stdin.encoding or "utf-8", errors="replace")
         if not line:
             if why := self.absence():
@@ -118,7 +118,7 @@ def _is_closed(fd: int, *, reading: bool = False) -> bool:
     if not hasattr(select, "poll"):  # Windows
         return False
     poller = select.poll()
-    # A socket reports this event if the other end sends no more; a terminal or a pipe reports POLLHUP.
+    # A socket reports POLLRDHUP when the other end stops sending; a terminal or a pipe reports POLLHUP.
     half_closed = getattr(select, "POLLRDHUP", 0) if reading else 0
     poller.register(fd, half_closed)
     return any(events & (select.POLLERR | select.POLLHUP | half_closed) for _, events in poller.poll(0))

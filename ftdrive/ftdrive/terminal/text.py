@@ -1,4 +1,4 @@
-"""Text for a terminal: line breaks between words, help, and tables."""
+"""Text for a terminal: line breaks between words, help texts, and tables."""
 
 import os
 import re
@@ -14,7 +14,7 @@ import click
 
 from ftdrive.words.text import GLUE, as_typed, is_command, visible
 
-# Replaces hyphens in help, because click would break lines at them.
+# Replaces hyphens in help texts, because click would break lines at them.
 _HYPHEN: Final = "\ue001"
 # A line width that no sentence exceeds.
 _WHOLE: Final = 1000
@@ -22,9 +22,9 @@ _QUOTED = re.compile(r"`[^`\n]+`")
 
 
 def glue(text: str, width: int | None = None) -> str:
-    """Return text in which each command in backticks is one word, unless wider than a line of `width` columns.
+    """Return text in which each command in backticks is one word, unless it is longer than `width` columns.
 
-    Fold the text, and print it after `unglue`.
+    Fold the text, then call `unglue` before printing it.
 
     Examples
     --------
@@ -37,12 +37,12 @@ def glue(text: str, width: int | None = None) -> str:
 
 
 def unglue(text: str) -> str:
-    """Return folded text with the spaces of its commands restored."""
+    """Return folded text with the spaces in its commands restored."""
     return text.replace(GLUE, " ")
 
 
 class WholeWords(click.HelpFormatter):
-    """Help in which addresses, options and commands in backticks are never broken, so that they can be copied."""
+    """Help texts in which addresses, options and commands in backticks are never broken, so that they can be copied."""
 
     def write_text(self, text: str) -> None:
         """Write a paragraph."""
@@ -72,21 +72,21 @@ class Group(click.Group):
 
 
 NARROWEST: Final = 20
-"""Smallest number of columns after a head; with fewer, lines are not indented."""
+"""Smallest number of columns after a head for which lines are indented."""
 
 
 def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
-    """Return text with lines broken between words for a terminal; unchanged for a file or pipe.
+    """Return text with lines broken between words for a terminal, or with unchanged lines for a file or pipe.
 
-    Control characters become visible. A longer word, such as a path, and a command in backticks stay whole. If the text
-    begins with `head`, further lines are indented to it, as in `hanging`.
+    Control characters become visible. Words longer than a line, such as paths, and commands in backticks stay whole. If
+    the text begins with `head`, the lines after the first are indented by its length.
     """
     text = visible(as_typed(text))
     try:
         width = os.get_terminal_size(file.fileno()).columns
     except (OSError, ValueError):  # not a terminal
         return text
-    # some terminals do not know their size
+    # some terminals report the size 0
     if width == 0:
         return text
     fold = textwrap.TextWrapper(
@@ -106,7 +106,7 @@ def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
 def echo(text: str = "", *, bold: str = "", err: bool = False, nl: bool = True, fold: bool = True) -> None:
     """Print text on stdout, or stderr with `err`, after the bold text `bold`.
 
-    On a terminal, lines break between words. Commands are printed in the form to type. With `fold=False`, text is data.
+    On a terminal, lines break between words. Commands are printed as they must be typed. `fold=False` is for data.
     """
 
     def shown(text: str) -> str:
@@ -122,11 +122,11 @@ GAP = "  "
 def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], folding: Collection[str]) -> None:
     """Print a table; files, pipes and wide terminals get one line per row.
 
-    `folding` contains the titles of columns that may be folded.
+    `folding` contains the titles of the columns that may be folded.
     """
     rows = [[visible(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
-    # number of columns in the first line of a row; the others follow on a line of their own
+    # number of columns in the first line of a row; the remaining columns follow on a second line
     beside = len(titles)
     if sys.stdout.isatty():
         least = [

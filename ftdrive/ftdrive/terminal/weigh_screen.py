@@ -11,7 +11,7 @@ from ftdrive.terminal.lines import STRONG, Line
 from ftdrive.words.stream import NO_MASS, name_devices, worth_of, zero_in_words
 
 _FIGURES = "0123456789-"
-# Three rows per figure, three characters wide.
+# Each digit has three rows and is three characters wide.
 _ROWS = (
     "█▀█ ▀█  ▀▀█ ▀▀█ █ █ █▀▀ █▀▀ ▀▀█ █▀█ █▀█",
     "█ █  █  █▀▀ ▀▀█ ▀▀█ ▀▀█ █▀█   █ █▀█ ▀▀█ ▀▀▀",
@@ -20,9 +20,9 @@ _ROWS = (
 
 
 class WeighScreen(Canvas):
-    """Screen of a scale; an error of a device or of the recording ends it.
+    """Screen of a scale; an error from a device or in the recording ends it.
 
-    `turns` reads the stream, see `pump`; `address` is the address of the page in the browser, or empty.
+    `turns` reads the stream, see `pump`; `address` is the address of the browser page, or empty.
     """
 
     def __init__(self, weighing: Weighing, turns: Iterable[object], address: str = "") -> None:
@@ -30,7 +30,7 @@ class WeighScreen(Canvas):
         self._weighing, self._turns = weighing, turns
 
     def draw(self, width: int, height: int) -> list[Line]:
-        """Draw the present state."""
+        """Draw the current state."""
         info, shown = self._weighing.stream.info, self._weighing.shown
         mass, beside = NO_MASS, list[str]()
         if (weight := shown.measured) is not None:
@@ -61,7 +61,7 @@ class WeighScreen(Canvas):
 
 
 def large_figures(text: str) -> list[str]:
-    """Return figures as three rows of block characters; other characters are in the last row."""
+    """Return digits as three rows of block characters; other characters are put into the last row."""
     rows = ["", "", ""]
     for one in text:
         at = 4 * _FIGURES.find(one)
