@@ -25,13 +25,13 @@ from ftdrivers.errors import DeviceError
 from ftdrivers.ur.kinematics import model_named
 
 _ROWS: Final = {TOOL: ("Cylinder", "Cylinders"), WALLS: ("Wall", "Walls and tables"), BOXES: ("Box", "Boxes")}
-# Parts of the form: sections of the configuration, and questions with several rows.
+# Parts of the form: sections of the configuration, and questions whose answers have several rows.
 _PARTS: Final = ("robot", "sensor", "tool", TOOL, "workcell", WALLS, BOXES)
-# Largest number of rows of one kind, and of uses of controls that wait while a device is read.
+# Largest number of rows of one kind, and of viewers' actions that are queued while a device is read.
 _MOST_ROWS, _MOST_USES = 30, 100
-# Entries of the drop-down lists that need a typed value.
+# Entries of the drop-down lists for which a value must be typed.
 _TYPED: Final = {WALLS: "slanting", MODEL: "choose", "workcell.mounting": "degrees"}
-# Tool with which the arm is drawn until a tool is described.
+# Tool drawn on the arm until a tool is described.
 _NO_TOOL: Final = ((0.0, 5.0, 60.0),)
 _LEGEND: Final = legend(
     ("arm", "body", "arm in its usual posture"),
@@ -54,13 +54,13 @@ class _Field:
 
     @property
     def text(self) -> str:
-        """The answer, in the form for the terminal."""
+        """The answer as it would be typed in the terminal."""
         typed = self.typed.strip()
         chosen = typed and f"{self.choice} {typed}" if self.key == WALLS else self.choice
         return typed if self.choice in ("", _TYPED.get(self.key)) else chosen
 
     def controls(self) -> list[Part]:
-        """Return the controls: selection, text field, and button to remove a row."""
+        """Return the controls: a selection, a text field, and a button that removes the row."""
         found, is_wall = [], self.key == WALLS
         if self.options:
             found += [choice(f"{self.name} choice", self.label + " at" * is_wall, self.choice, self.options)]
@@ -72,16 +72,16 @@ class _Field:
 
 
 class InitPage:
-    """Fills a page with the form, and a description from its answers; `draft` stores the answers after each change.
+    """Fills a page with the form, and a description with its answers; `draft` stores the answers after each change.
 
-    `say` receives the report of a device, with a mark for the start of the line.
+    `say` receives the report on a device, and a mark for the start of the line.
     """
 
     def __init__(
         self, page: Page, described: Description, draft: Path, name: str, say: Callable[[str, str], object]
     ) -> None:
         self._page, self._described, self._draft, self._name, self._say = page, described, draft, name, say
-        # Only the thread of `run` changes anything: the thread of the server queues the actions of viewers here.
+        # Only the thread that runs `run` changes anything: the server thread queues the viewers' actions here.
         self._todo: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._asked: dict[str, None] = {}
         self._fields: dict[str, _Field] = {}
@@ -98,7 +98,7 @@ class InitPage:
         self._read()
         self._saved = dict(described.texts)
 
-    # large numbers may overflow, and are then judged as invalid
+    # large numbers may overflow and are then judged invalid
     @np.errstate(all="ignore")
     def run(self) -> None:
         """Show and judge the answers until the file is to be written."""
@@ -107,12 +107,12 @@ class InitPage:
                 self._look()
                 self._refresh()
             self._asked.clear()
-            # judge everything that was typed in the meantime together
+            # judge everything typed in the meantime at once
             for _ in range(max(1, self._todo.qsize())):
                 self._todo.get()()
 
     def conclude(self, *words: str) -> None:
-        """Show at the top and at the Write button that the file is written."""
+        """Show at the top and at the Write button that the file has been written."""
         written = lines(*words, head="Written", tone=GOOD)
         self._page.put({"result": written, "form/words": written, "form/write": None})
 
@@ -232,7 +232,7 @@ class InitPage:
         end(failure)
 
     def _draw(self, wrong: Collection[_Field]) -> str:
-        """Draw the cell, with invalid and obstructing parts in red; return what is closer to the arm than allowed."""
+        """Draw the cell, with invalid and obstructing parts in red; describe what is closer to the arm than allowed."""
         rows = {key: [one for one in self._fields.values() if one.key == key and one.value] for key in _ROWS}
         tool, planes, boxes = (tuple(field.value for field in rows[key]) for key in _ROWS)
         workcell = WorkcellConfig(planes_mm=planes, boxes_mm=boxes)

@@ -1,4 +1,4 @@
-"""How a session is shown on a page, and how a calibration or a verification ends there."""
+"""Shows a session on a page, and how a calibration or a verification ended."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -27,9 +27,9 @@ _SHOWN: Final = {"mass_kg", "p_sensor_com_m", "R_flange_sensor"}
 def on_page(
     page: Page | None, operator: Operator, options: SessionOptions, command: str = "calibrate"
 ) -> Iterator[tuple[Operator, SessionOptions]]:
-    """Show a session on a page, if there is one, while the block runs; yields the operator and options to use.
+    """Show a session on the page, if there is one, while the block runs; yield the operator and the options to use.
 
-    If the block raises, the page shows the message printed in the terminal.
+    If the block raises an error, the page shows the message that the terminal prints.
     """
     if page is None:
         yield operator, options
@@ -51,7 +51,7 @@ def _last_line(error: BaseException) -> str:
 
 
 def conclude_calibration(page: Page | None, result: CalibrationResult, commands: Sequence[str]) -> None:
-    """Show verdict, estimates, findings and next commands, if there is a page."""
+    """Show the verdict, estimates, findings and next commands on the page, if there is one."""
     if page is None:
         return
     figures = []
@@ -66,7 +66,7 @@ def conclude_calibration(page: Page | None, result: CalibrationResult, commands:
 
 
 def conclude_verification(page: Page | None, verified: Verified, *following: str) -> None:
-    """Show the outcome, the largest differences and the next commands, if there is a page."""
+    """Show the outcome, the largest differences and the next commands on the page, if there is one."""
     if page is None:
         return
     found, figures = verified.verification, []

@@ -1,4 +1,4 @@
-"""A page of a command: named parts shown by browsers, controls used by viewers, and the loop that draws the page."""
+"""A command's page: named parts that browsers show, controls that viewers use, and the loop that draws the page."""
 
 import json
 import logging
@@ -13,9 +13,9 @@ from ftdrive.view.parts import Part, button, controls
 
 log = logging.getLogger(__name__)
 
-# On a busy computer with delays, this period still gives 20 drawings per second.
+# Even with the delays of a busy computer, this period gives 20 drawings per second.
 _PERIOD_S: Final = 0.045
-# A drawing that takes longer than this, s, is considered to hang.
+# A drawing that takes longer than this, s, is considered hung.
 HUNG_S: Final = 5.0
 _TEXT: Final = 10_000
 
@@ -25,11 +25,11 @@ class Page:
 
     def __init__(self, title: str) -> None:
         self.url = ""
-        """Address with the token, which is required."""
+        """Address, including the required token."""
         self.viewers = 0
-        """Number of browsers that show the page."""
+        """Number of browsers that are showing the page."""
         self._lock = threading.Lock()
-        # Each part with its JSON text and the version of the page that changed it.
+        # Each part with its JSON text and the page version in which it last changed.
         self._parts: dict[str, tuple[Part | None, str, int]] = {}
         self._version = 0
         self._acts: dict[str, Callable[[str, Any], object]] = {}
@@ -39,7 +39,7 @@ class Page:
     def put(self, parts: Mapping[str, Part | None]) -> None:
         """Show parts by name, all at once; None removes a part. Unchanged parts are not sent again.
 
-        The name before a slash is the name of a place in `page.html`, such as `state`, or `scene`.
+        The name up to the first slash is that of a place in `page.html`, such as `state`, or `scene`.
         """
         texts = {name: json.dumps(part, allow_nan=False, separators=(",", ":")) for name, part in parts.items()}
         with self._lock:
@@ -49,9 +49,9 @@ class Page:
                     self._parts[name] = parts[name], text, self._version
 
     def on(self, name: str, act: Callable[[str, Any], object]) -> None:
-        """Call `act` with viewer and valid value when a viewer uses the visible control of this name.
+        """Call `act` with the viewer and the valid value when a viewer uses the visible control of this name.
 
-        `act` is called in the thread of the server and must not wait; its `ValueError` is shown to the viewer.
+        `act` is called in the server thread and must not wait; a `ValueError` from it is shown to the viewer.
         """
         self._acts[name] = act
 
@@ -61,7 +61,7 @@ class Page:
         self.on("stop", lambda viewer, _: stop(viewer))
 
     def act(self, viewer: str, name: object, value: object) -> None:
-        """Operate a control for a viewer. Raises `ValueError` if it is not visible, or the value is invalid."""
+        """Operate a control for a viewer. Raises `ValueError` if it is not visible or the value is invalid."""
         with self._lock:
             shown = [part["controls"] for part, _, _ in self._parts.values() if part and part["kind"] == "controls"]
         found = next((one for part in shown for one in part if one["name"] == name and not one.get("disabled")), None)
@@ -70,22 +70,22 @@ class Page:
         self._acts[found["name"]](viewer, _valid_value(found, value))
 
     def since(self, version: int) -> tuple[int, str]:
-        """Return the present version, and the parts newer than `version` as JSON; empty if there are none."""
+        """Return the current version, and the parts newer than `version` as JSON; empty if there are none."""
         with self._lock:
             newer = [f"{json.dumps(name)}:{text}" for name, (_, text, at) in self._parts.items() if at > version]
             return self._version, f"{{{','.join(newer)}}}" if newer else ""
 
     def beat(self) -> None:
-        """Mark the page as drawn now; from then on the page is stale if it is not drawn again."""
+        """Mark the page as drawn now; from now on, it becomes stale unless it is drawn again."""
         self._drawn_s = monotonic()
 
     def rest(self) -> None:
-        """Mark the page as drawn on events only, as before the first `beat`."""
+        """Mark the page as drawn only on events, as before the first `beat`."""
         self._drawn_s = None
 
     @property
     def stale_s(self) -> float:
-        """Time since the page was drawn, s; 0 for a page that is drawn on events only."""
+        """Time since the page was last drawn, s; 0 for a page that is drawn only on events."""
         return 0.0 if self._drawn_s is None else monotonic() - self._drawn_s
 
 
@@ -107,13 +107,13 @@ def _valid_value(control: Part, value: object) -> object:
 
 @contextmanager
 def drawing(page: Page, draw: Callable[[], None], say: Callable[[str], object] = log.error) -> Iterator[None]:
-    """Call `draw` 22 times per second in another thread while the block runs; `say` receives an error that ends it."""
+    """Call `draw` 22 times per second in a thread while the block runs; `say` receives an error that ends the calls."""
     ended = threading.Event()
 
     def run() -> None:
         due_s = monotonic()
         try:
-            # drawings missed in a pause of the computer are not made up for
+            # drawings missed while the computer was busy are not made up for
             while not ended.wait(max(0.0, due_s - monotonic())):
                 due_s = max(due_s + _PERIOD_S, monotonic())
                 draw()

@@ -1,4 +1,4 @@
-"""Parts of a page as plain values, drawn by `shell/page.js`. All text is shown as text, never as HTML."""
+"""Parts of a page as plain values, which `shell/page.js` draws. All text is shown as text, never as HTML."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
@@ -17,35 +17,35 @@ QUIET: Final = "quiet"
 
 
 def lines(*texts: str, head: str = "", tone: str = "") -> Part:
-    """Return texts one below the other, with a heading; a tone colours them."""
+    """Return lines of text with a heading; a tone colours them."""
     return {"kind": "lines", "head": head, "lines": [text for text in texts if text], "tone": tone}
 
 
 def reading(
     label: str, value: str, unit: str, *, sigma: str = "", note: str = "", size: str = "", tone: str = ""
 ) -> Part:
-    """Return a measured value for `readings`, of size `huge`, `large` or normal; `sigma` is shown after the value."""
+    """Return a measured value for `readings`, in size `huge`, `large` or normal; `sigma` is shown after the value."""
     return {"label": label, "value": value, "unit": unit, "sigma": sigma, "note": note, "size": size, "tone": tone}
 
 
 def readings(*rows: Part, head: str = "") -> Part:
-    """Return large values made by `reading`."""
+    """Return measured values, each made by `reading`."""
     return {"kind": "numbers", "head": head, "rows": list(rows)}
 
 
 def text_table(rows: Iterable[Sequence[str]], columns: Sequence[str] = (), head: str = "") -> Part:
-    """Return rows of texts; a text with newlines has several lines."""
+    """Return a table of texts; a text with newlines has several lines."""
     return {"kind": "table", "head": head, "columns": list(columns), "rows": [list(row) for row in rows]}
 
 
 def bar(label: str, value: float, limit: float, text: str, *, signed: bool = True, tone: str = "") -> Part:
-    """Return a value for `bars`, drawn from zero towards its limit; zero is central if `signed`, else at the left."""
+    """Return a value for `bars`, drawn from zero towards its limit; zero is centred if `signed`, else on the left."""
     share = float(np.clip(np.nan_to_num(value / limit), -1, 1)) if limit > 0 else 0.0
     return {"label": label, "share": round(share, 3), "text": text, "signed": signed, "tone": tone}
 
 
 def bars(*rows: Part, head: str = "") -> Part:
-    """Return values with their limits, made by `bar`."""
+    """Return values with their limits, each made by `bar`."""
     return {"kind": "bars", "head": head, "rows": list(rows)}
 
 
@@ -55,12 +55,12 @@ def controls(*found: Part, head: str = "", note: str = "") -> Part:
 
 
 def button(name: str, label: str, *, key: str = "", tone: str = "", disabled: bool = False) -> Part:
-    """Return a button; `key` is the terminal's key for the same action."""
+    """Return a button; `key` is the key for the same action in the terminal."""
     return {"name": name, "type": "button", "label": label, "key": key, "tone": tone, "disabled": disabled}
 
 
 def text_field(name: str, label: str, value: str, **more: Any) -> Part:
-    """Return a text field; `more` can be `words` below it with a `tone`, and `disabled`, as for the fields below."""
+    """Return a text field; `more` may be `words` below it with a `tone`, and `disabled`, as for `choice`."""
     return {"name": name, "type": "text", "label": label, "value": value, **more}
 
 
@@ -75,7 +75,7 @@ def check_box(name: str, label: str, *, value: bool) -> Part:
 
 
 def slider(name: str, label: str, value: float, most: float, *, step: float = 1.0, text: str = "") -> Part:
-    """Return a slider from 0 to `most`; `text` shows its value."""
+    """Return a slider from 0 to `most`; `text` states its value."""
     return {"name": name, "type": "range", "label": label, "value": value, "max": most, "step": step, "text": text}
 
 

@@ -1,4 +1,4 @@
-"""The page of a plan: the tour in motion, its swept volume, and its largest move."""
+"""The page of a plan: the motion along the tour, the swept volume, and the largest move."""
 
 import threading
 from time import monotonic
@@ -21,11 +21,11 @@ PLAN_LEGEND: Final = (
     *((scene.ARM, "body", "arm"), (scene.TOOL, "body", "tool"), (scene.PATH, "line", "path of the tool tip")),
     *((scene.GHOST, "ball", "ball to keep free"), (scene.OBSTACLE, "body", "surroundings")),
 )
-"""Legend of `plan_parts` and an arm."""
+"""Legend for `plan_parts` and an arm."""
 
 
 class PlanTimeline:
-    """A plan over time at its speeds, after the approach `way_rad` (k + 1, 6) to its first pose, if any."""
+    """A plan as joint angles over time, after the approach `way_rad` (k + 1, 6) to its first pose, if any."""
 
     def __init__(self, plan: Plan, way_rad: ArrayLike = ()) -> None:
         self.plan, way, tour = plan, np.reshape(way_rad, (-1, 6)), [step.q_rad for step in plan.steps]
@@ -38,7 +38,7 @@ class PlanTimeline:
         self.q_rad = self.at(np.union1d(self._t_s, np.arange(0, self.end_s, 0.1)))
 
     def at(self, t_s: ArrayLike) -> Array:
-        """Return joint vectors (..., 6) at times (...)."""
+        """Return the joint angles (..., 6) at times (...)."""
         return np.stack(
             [np.interp(np.asarray(t_s, dtype=np.float64), self._t_s, joint) for joint in self._nodes_rad.T], axis=-1
         )
@@ -48,7 +48,7 @@ class PlanTimeline:
         return int(np.searchsorted(self.begins_s, t_s, side="right")) - 1
 
     def slider(self, t_s: float) -> Part:
-        """Return the slider `along` at a time, with a text for pose and time."""
+        """Return the slider `along` at a time, with a text that states pose and time."""
         pose = f"pose {self.move(t_s) + 1} of {len(self.begins_s)}, " if self.move(t_s) >= 0 else "approach, "
         words = f"{'' if self.plan.sweep else pose}{t_s:.0f} of {self.end_s:.0f} s"
         return slider("along", "Along the plan", round(t_s, 1), round(self.end_s, 1), step=0.1, text=words)
@@ -104,7 +104,7 @@ class PlanPage:
         self._page.put({**scene.arm_parts(self._arm, self._tour.at(t_s)), **volumes, **parts})
 
     def play(self, ended: threading.Event) -> None:
-        """Draw the choices of viewers, and the arm in motion along the tour, until the event."""
+        """Draw what viewers choose, and the arm moving along the tour, until `ended` is set."""
         then_s = monotonic()
         while not ended.wait(_FRAME_S):
             passed_s, then_s = monotonic() - then_s, monotonic()
@@ -116,7 +116,7 @@ class PlanPage:
 
 
 def plan_parts(certifier: Certifier, tour: PlanTimeline) -> dict[str, Part | None]:
-    """Return cell, free ball, path of the tool tip, and camera."""
+    """Return the cell, the ball to keep free, the path of the tool tip, and the camera."""
     arm, size_m, plan = certifier.arm, scene.size_of(certifier), tour.plan
     farthest = int(np.argmax([part.to_m for part in arm.tool]))
     look_at = 0.7 * arm.frames(tour.q_rad[:1]).wrist_m[0]
@@ -137,7 +137,7 @@ def _swept_scene(certifier: Certifier, q_rad: Array) -> dict[str, Part | None]:
 
 
 def describe_move(plan: Plan, move: int) -> tuple[str, str, str]:
-    """Return texts about a move, its smallest distance, and the space to keep free."""
+    """Return texts about a move, its smallest clearance, and the space to keep free."""
     if move < 0:
         return "From the present posture to the first pose", "This approach is confirmed separately.", ""
     step, following = plan.steps[move], plan.steps[(move + 1) % len(plan.steps)]

@@ -1,4 +1,4 @@
-"""Parts of a page for the three-dimensional view of the cell, drawn by `shell/scene.js`; m, base axes."""
+"""Parts of a page for the three-dimensional view of the cell, which `shell/scene.js` draws; m, base axes."""
 
 from collections.abc import Collection, Sequence
 from typing import Any, Final
@@ -12,15 +12,15 @@ from ftdrive.planning.geometry.scene import Scene
 from ftdrive.view.parts import Part, rounded_list
 from ftdrivers.ur.kinematics import Array
 
-# Names of colours, defined in `shell/page.css` for light and dark.
+# Names of colours, which `shell/page.css` defines for light and dark mode.
 ARM, TOOL, GHOST, OBSTACLE, BAD = "arm", "tool", "ghost", "obstacle", "bad"
 FORCE, TORQUE, PATH, UNKNOWN = "force", "torque", "path", "unknown"
 
 
 def body(half_length_m: float, radius_m: float, rounding_m: float, colour: str, **more: Any) -> Part:
-    """Return a cylinder along z with rounded edges: a capsule for radius 0, a ball for radius and length 0.
+    """Return a cylinder along z with rounded edges: a capsule if the radius is 0, a ball if the length is 0 too.
 
-    `more` are `at` (3,), `turn` (4,), a quaternion with w first, `alpha`, and `copies` (n, 7), position and turn.
+    `more` may be `at` (3,), `turn` (4,), a quaternion with w first, `alpha`, and `copies` (n, 7), positions and turns.
     """
     shape = rounded_list([half_length_m, radius_m, rounding_m])
     return {"kind": "body", "shape": shape, "colour": colour} | {
@@ -34,7 +34,7 @@ def ball(radius_m: float, colour: str, **more: Any) -> Part:
 
 
 def box(size_m: ArrayLike, colour: str, **more: Any) -> Part:
-    """Return a box about its centre; `more` as for `body`."""
+    """Return a box centred at its origin; `more` as for `body`."""
     return {"kind": "box", "size": rounded_list(size_m), "colour": colour} | {
         name: rounded_list(one) for name, one in more.items()
     }
@@ -46,12 +46,12 @@ def path(points_m: Array, colour: str) -> Part:
 
 
 def dots(points_m: ArrayLike, colours: Sequence[str], at: ArrayLike) -> Part:
-    """Return round dots at points (n, 3) relative to `at`, with one size on every screen."""
+    """Return round dots at points (n, 3) relative to `at`, of the same size on every screen."""
     return {"kind": "dots", "points": rounded_list(points_m), "colours": list(colours), "at": rounded_list(at)}
 
 
 def axes(length_m: float, at: ArrayLike = (0, 0, 0), turn: ArrayLike = (1, 0, 0, 0), *, named: bool = False) -> Part:
-    """Return axes x, y, z in red, green and blue, with names on request."""
+    """Return the axes x, y, z in red, green and blue, with their names on request."""
     return {"kind": "axes", "length": length_m, "at": rounded_list(at), "turn": rounded_list(turn), "named": named}
 
 
@@ -66,7 +66,7 @@ def camera(at_m: ArrayLike, from_m: ArrayLike) -> Part:
 
 
 def legend(*rows: tuple[str, str, str]) -> Part:
-    """Return a legend with colour, mark (`body`, `ball`, `line` or `arrow`) and text per row."""
+    """Return a legend; each row has a colour, a mark (`body`, `ball`, `line` or `arrow`) and a text."""
     return {"kind": "legend", "rows": [list(row) for row in rows]}
 
 
@@ -79,7 +79,7 @@ def arm_parts(
     clear: bool = False,
     bad: Collection[str] = (),
 ) -> dict[str, Part | None]:
-    """Return an arm with its tool at joint angles (6,); without angles, the removal of the arm.
+    """Return an arm with its tool at joint angles (6,); without angles, the parts that remove the arm.
 
     A `ghost` is transparent and shows where the arm will be. With `clear`, the tool is transparent, so that a wrench
     inside it is visible. Bodies named in `bad` are red.
@@ -112,7 +112,7 @@ def carried_bodies(arm: ArmModel) -> range:
 
 
 def surroundings(scene: Scene, size_m: float, bad: Collection[str] = ()) -> dict[str, Part | None]:
-    """Return base axes, planes as squares of `size_m`, and boxes; those named in `bad`, such as "plane 2", are red."""
+    """Return base axes, planes as `size_m` squares, and boxes; those named in `bad`, such as "plane 2", are red."""
     parts: dict[str, Part | None] = {"scene/base": axes(0.25, named=True)}
     for i, plane in enumerate(scene.planes, start=1):
         colour = BAD if f"plane {i}" in bad else OBSTACLE
@@ -128,7 +128,7 @@ def surroundings(scene: Scene, size_m: float, bad: Collection[str] = ()) -> dict
 def wrench_parts(p_base_m: Array, wrench_base: Array, m_per_N: float, m_per_Nm: float) -> dict[str, Part | None]:
     """Return force and torque as arrows, and the line of action of the force.
 
-    The wrench (6,), N and N·m, acts about a point (3,), base axes; zero force or torque is not drawn.
+    The wrench (6,), N and N·m, acts about a point (3,), base axes; a zero force or torque is not drawn.
     """
     parts: dict[str, Part | None] = dict.fromkeys(NO_WRENCH)
     for name, vector, m in (("force", wrench_base[:3], m_per_N), ("torque", wrench_base[3:], m_per_Nm)):
@@ -144,11 +144,11 @@ def wrench_parts(p_base_m: Array, wrench_base: Array, m_per_N: float, m_per_Nm: 
 
 
 NO_WRENCH: Final[dict[str, Part | None]] = {"scene/force": None, "scene/torque": None, "scene/line of action": None}
-"""Removal of the arrows of a wrench."""
+"""Parts that remove the arrows of a wrench."""
 
 
 def size_of(certifier: Certifier) -> float:
-    """Return twice the reach of an arm, m, the size at which planes are drawn."""
+    """Return twice the reach of the arm, m, which is the size of the drawn planes."""
     arm = certifier.arm
     return 2 * (arm.ball_m + float(np.linalg.norm(arm.kinematics.links_m[1:3], axis=1).sum()))
 

@@ -1,4 +1,4 @@
-"""The page of a session: state, question, forces and estimates next to the scene; Stop; the result at the end."""
+"""The page of a session: state, question, forces and estimates next to the scene, a Stop button, the final result."""
 
 import logging
 import threading
@@ -38,11 +38,11 @@ log = logging.getLogger(__name__)
 Parts = dict[str, Part | None]
 
 _FRAME_S: Final = 0.05
-# Guards that have not looked for this time are at rest, s.
+# Guards that have checked nothing for this time are inactive, s.
 _REST_S: Final = 0.5
-# From this share of a limit on, a bar has the colour of a warning.
+# A bar above this share of its limit has the colour of a warning.
 _NEAR: Final = 0.8
-# Colours of poses, each with the largest residual for which it is used, in sigmas.
+# Colours of poses, each with the largest residual, in sigmas, for which it is used.
 _COLOURS: Final = ((3.0, GOOD, "residual ≤ 3 sigma"), (5.0, WARN, "≤ 5 sigma"), (np.inf, BAD, "> 5 sigma"))
 _POSES: Final = [
     (name, "ball", f"pose, {words}") for _, name, words in (*_COLOURS, (0, scene.UNKNOWN, "no residual yet"))
@@ -50,7 +50,7 @@ _POSES: Final = [
 _SPHERE_M: Final = 0.18
 # In a hand-guided session, the scene has no arm.
 _ALONE: Final[Parts] = {"scene/camera": scene.camera([0, 0, 0], [0.5, 0.5, 0.3]), "scene/legend": scene.legend(*_POSES)}
-# States before the arm has reached its stop.
+# States in which the arm has not reached its stop yet.
 _TOWARDS: Final = frozenset({State.APPROACH, State.MOVE})
 # Parts that are valid only while the session runs, and are removed at its end.
 _LIVE: Final = ("stop", "alert", "question", "question/along", "state/progress", "state/note", "bars", "bars/guards")
@@ -58,24 +58,24 @@ _ENDED: Final[Parts] = {**dict.fromkeys(_LIVE), "state": lines(head="ended")}
 
 
 class Onlooker(Guard):
-    """Guard that keeps the newest observation, and never trips."""
+    """A guard that stores the latest observation and never trips."""
 
     def __init__(self) -> None:
         self.seen: Seen | None = None
         self.fresh_s = self.age_s = self.looked_s = 0.0
-        """First sight of the newest sample, its age, and the last look on the computer's clock, s."""
+        """Arrival and age of the newest sample, and the last call of `look` on the computer's clock, s."""
 
     def look(self, seen: Seen) -> None:
-        """Keep the observation."""
+        """Store the observation."""
         if self.seen is None or seen.sample != self.seen.sample:
             self.fresh_s = seen.t_s
         self.seen, self.age_s, self.looked_s = seen, seen.t_s - self.fresh_s, time.monotonic()
 
 
 class SessionPage:
-    """An operator that shows the session of another operator on a page, on which any viewer may stop it.
+    """An operator that shows another operator's session on a page, where any viewer can stop it.
 
-    The other operator answers the questions. A thread draws the newest state while the page is open in a browser, so
+    The other operator answers the questions. A thread draws the current state while the page is open in a browser, so
     that browsers do not delay the session. If drawing fails or hangs, the session continues and `pressed` reports it.
     """
 
@@ -86,8 +86,8 @@ class SessionPage:
         self._question: Question | None = None
         self._stopped_by = self._note = self._failure = ""
         self._is_reported = False
-        self._stop = 1  # the last stop is kept, because a hold has none
-        # Largest residual per stop, in sigmas.
+        self._stop = 1  # the last stop, stored because a hold has none
+        # Largest residual at each stop, in sigmas.
         self._residuals: dict[int, float | None] = {}
         self._plan: events.Planned | None = None
         self._cell: tuple[Certifier, RangeGuard] | None = None
@@ -110,16 +110,16 @@ class SessionPage:
         self._page.put(_ENDED)
 
     def stop(self, viewer: str) -> None:
-        """Stop the session for a viewer, as the key q does. Only the first request counts."""
+        """Stop the session for a viewer, like the key q. Only the first request counts."""
         self._stopped_by = self._stopped_by or viewer
 
     def watch(self, certifier: Certifier, load: RangeGuard) -> Onlooker:
-        """Draw this cell from now on, with the returned guard as observer. See `SessionOptions.watch`."""
+        """Draw this cell from now on, as the returned guard observes it. See `SessionOptions.watch`."""
         self._cell = certifier, load
         return self._onlooker
 
     def show(self, event: Event) -> None:
-        """Store what the page draws, and show the event."""
+        """Store what the page draws, and pass the event to the other operator."""
         with self._lock:
             self._view.update(event, time.monotonic())
             match event:
@@ -140,7 +140,7 @@ class SessionPage:
         self._operator.show(event)
 
     def ask(self, question: Question) -> str:
-        """Ask in the terminal. Raises `Declined` also if a viewer has stopped the session."""
+        """Ask in the terminal. Also raises `Declined` if a viewer has stopped the session."""
         self._report_failure()
         self._require_unstopped()
         self._question, self._view.keys = question, "asking"
@@ -152,16 +152,16 @@ class SessionPage:
         return answer
 
     def absence(self) -> str | None:
-        """Return why no operator follows, or None. Viewers of the page do not count."""
+        """Return why no operator follows the session, or None. Viewers of the page do not count as operators."""
         return self._operator.absence()
 
     @property
     def has_keys(self) -> bool:
-        """Whether the terminal has keys."""
+        """Whether keys are read in the terminal."""
         return self._operator.has_keys
 
     def pressed(self) -> Key | None:
-        """Return `Key.STOP` after a viewer has pressed Stop, else the key of the terminal."""
+        """Return `Key.STOP` after a viewer has pressed Stop, else the key pressed in the terminal."""
         self._report_failure()
         return Key.STOP if self._stopped_by else self._operator.pressed()
 
@@ -172,7 +172,7 @@ class SessionPage:
 
     @property
     def kept(self) -> Sequence[str]:
-        """Lines of the last note if there is a run; after an early end, what is stored and how to continue."""
+        """Lines of the last note if there is a run; after an early end, they say what is stored and how to continue."""
         return self._note.split("\n") if self._view.folder else ()
 
     def _require_unstopped(self) -> None:
@@ -204,7 +204,7 @@ class SessionPage:
             log.debug("the page cannot be drawn", exc_info=True)
 
     def draw(self) -> None:
-        """Show the newest state to browsers."""
+        """Send the current state to browsers."""
         with self._lock:
             view = replace(self._view, taken=dict(self._view.taken), compared=dict(self._view.compared))
             residuals, note = dict(self._residuals), self._note
@@ -219,11 +219,11 @@ class SessionPage:
             parts |= self._forces(seen, self._cell[1])
         downs = [(pose.gravity_flange, residuals.get(stop)) for stop, (pose, _) in view.taken.items()]
         parts |= _gravity_sphere(downs, None if self._scene is None else self._scene.sphere_m)
-        # a drawing that hung may continue after the end
+        # a hung drawing may continue after the end
         self._page.put(parts | (_ENDED if self._ended.is_set() else {}))
 
     def _forces(self, seen: Seen, load: RangeGuard) -> Parts:
-        """Return force and torque with the limits of their guard, and speed and age of the guards' data."""
+        """Return force and torque with the limits of their guard, and the joint speed and the age of the sample."""
         if time.monotonic() - self._onlooker.looked_s > _REST_S:
             rest = "The guards are inactive: the arm is drawn at their last observation."
             return {"bars": lines(rest, tone=QUIET), "bars/guards": None}
@@ -236,7 +236,7 @@ class SessionPage:
         head = "Force and torque, since the start" if load.zero.any() else "Force and torque"
         speed_deg_s, age_ms = np.degrees(np.abs(seen.state.qd_rad_s).max()), 1e3 * self._onlooker.age_s
         guards = text_table([("joint speed", f"{speed_deg_s:.0f} °/s"), ("age of the sample", f"{age_ms:.0f} ms")])
-        if load.range is None:  # without limits there are no bars
+        if load.range is None:  # without limits, no bars can be drawn
             forces = [(row["label"], row["text"]) for row in rows]
             return {"bars": text_table(forces, head=f"{head}; range not known"), "bars/guards": guards}
         return {"bars": bars(*rows, head=head), "bars/guards": guards}
@@ -250,7 +250,7 @@ class _Cell:
         """Position along the plan shown during a question."""
         wrist_m, size_m = self._arm.frames(self._tour.q_rad[:1]).wrist_m[0], scene.size_of(certifier)
         self.sphere_m = wrist_m + np.array([0.0, 0.0, 0.25 * size_m])
-        # Arm and sphere are visible.
+        # This view shows both the arm and the sphere.
         look_at = 0.65 * self.sphere_m
         camera = scene.camera(look_at, look_at + 0.7 * size_m * np.array([1.0, 1.0, 0.4]))
         rows = *PLAN_LEGEND, (scene.GHOST, "body", "next pose"), *_POSES
@@ -259,7 +259,7 @@ class _Cell:
     def parts(
         self, now: events.StateChanged | None, stop: int, seen: Seen | None, question: Question | None, *, ended: bool
     ) -> Parts:
-        """Return the arm as last seen, its goal, and during a question the slider along the plan."""
+        """Return the arm as last observed, its goal, and during a question the slider along the plan."""
         nodes, goal_rad, along = self._tour.plan.nodes_rad, None, None
         if question is not None:
             if question is not self._asked:
@@ -280,7 +280,7 @@ class _Cell:
 
 
 def question_part(question: Question | None) -> Part | None:
-    """Return the question that waits in the terminal."""
+    """Return the question that waits for its answer in the terminal."""
     return None if question is None else lines(question.text, head="Answer in the terminal", tone=ASK)
 
 
@@ -336,7 +336,7 @@ def _gravity_sphere(downs: Sequence[tuple[Array, float | None]], above_m: Array 
 def conclude(
     page: Page, head: str, *words: str, tone: str = "", figures: Sequence[Part] = (), following: Sequence[str] = ()
 ) -> None:
-    """Show how a session ended; `figures` are made by `reading`, `following` are the next commands."""
+    """Show how a session ended; `reading` makes the `figures`, and `following` are the next commands."""
     page.put(
         {
             "result": lines(head=head, tone=tone),

@@ -1,4 +1,4 @@
-"""The HTTP side of a page: address, access, files, stream of parts, and requests of controls."""
+"""The HTTP side of a page: address, access, files, the stream of parts, and requests from controls."""
 
 import asyncio
 import hmac
@@ -28,17 +28,17 @@ from ftdrivers.installation import missing_extra
 
 # By default, only this computer can open the page.
 _LOCAL: Final[Address] = ("127.0.0.1", 8080)
-# On a busy computer with delays, this period still gives 20 updates per second.
+# Even with the delays of a busy computer, this period gives 20 updates per second.
 _PERIOD_S: Final = 0.045
-# Period of heartbeats, s. A browser that misses several of them shows the page as stale.
+# Heartbeat period, s. A browser that misses several heartbeats shows the page as stale.
 _BEAT_S: Final = 1.0
-# A viewer with a non-empty buffer receives no more data, and is disconnected after this time, s.
+# A viewer with a non-empty buffer is sent no more data, and is disconnected after this time, s.
 _SUSPENDED_S: Final = 30.0
 _VIEWERS: Final = 300
-# Largest body of a request, and its time-out, s.
+# Largest body of a request, bytes, and the time-out for its body, s.
 _BODY_BYTES: Final = 1 << 15
 _BODY_S: Final = 5.0
-# Policy: nothing from other sites, no inline script, no embedding in other pages. uPlot sets styles of elements.
+# Policy: nothing from other sites, no inline scripts, no embedding in other pages. uPlot sets inline styles.
 _SAFE: Final = (
     "Content-Security-Policy: default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
     "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -55,22 +55,22 @@ _log = logging.getLogger(__name__)
 class Site(Gate):
     """Serves a page to browsers that have opened its address with the token, which they keep as a cookie.
 
-    Port 0 lets the system choose, see `port`. Raises `ConfigError` if the extra `viz` is not installed, and `OSError`
-    for an address that cannot be used.
+    With port 0, the system chooses one; see `port`. Raises `ConfigError` if the extra `viz` is not installed, and
+    `OSError` for an address that cannot be used.
     """
 
     def __init__(self, page: Page, bound: Address) -> None:
-        _files()  # a missing file raises before the port is opened
+        _files()  # raise for a missing file before the port is opened
         self.token = secrets.token_urlsafe(18)
         self._page = page
-        # For each viewer, its version of the page, and the time at which its buffer was last empty.
+        # For each viewer, the page version that it has, and the time at which its buffer was last empty.
         self._viewers: dict[asyncio.StreamWriter, tuple[int, float]] = {}
         self._opened = 0
         super().__init__(bound)
         asyncio.run_coroutine_threadsafe(self._send_all(), self.loop)
 
     async def serve(self, request: Request) -> None:
-        """Answer a request of the page's own origin."""
+        """Answer a request, which must come from the page's own origin."""
         path, _, query = request.target.partition("?")
         number = self._viewer_of(request.headers.get("Cookie", ""))
         if path == "/" and request.method == "GET" and query.startswith("token="):
@@ -91,7 +91,7 @@ class Site(Gate):
             await request.refuse(HTTPStatus.NOT_FOUND, "this page does not exist")
 
     def end(self) -> None:
-        """Send the last state and the end of the program to browsers, which keep showing it."""
+        """Send browsers the last state, which they keep showing, and the notice that the program has ended."""
         with suppress(TimeoutError):
             asyncio.run_coroutine_threadsafe(self._end_viewers(), self.loop).result(1.0)
 
@@ -101,8 +101,8 @@ class Site(Gate):
             return
         if number is None:
             number, self._opened = self._opened, self._opened + 1
-        # Browsers send the cookies of one port to all ports of a host, so the name contains the port. The page reloads
-        # itself, because browsers send no strict cookie after a redirect from another page.
+        # Browsers send the cookies of one port to all ports of a host, so the cookie's name contains the port. The page
+        # reloads itself, because browsers send no strict cookie after a redirect from another page.
         cookie = f"Set-Cookie: ftdrive-{self.port}={self.token}.{number}; HttpOnly; SameSite=Strict; Path=/"
         await request.answer(HTTPStatus.OK, _OPENED, "text/html; charset=utf-8", cookie, *_SAFE)
 
@@ -115,7 +115,7 @@ class Site(Gate):
         return None
 
     async def _act(self, request: Request, viewer: str) -> None:
-        """Pass a request of a control to the page; foreign pages cannot send this type without a preflight request."""
+        """Pass a control's request to the page; other sites cannot send its type without a preflight request."""
         headers = request.headers
         length = headers.get("Content-Length", "")
         if headers.get("Origin") is None or headers.get("Content-Type") != "application/json":
@@ -138,7 +138,7 @@ class Site(Gate):
                     await request.answer(HTTPStatus.NO_CONTENT)
 
     async def _follow(self, request: Request, number: int) -> None:
-        """Send parts as server-sent events until the browser disconnects; bytes from the browser are ignored."""
+        """Start server-sent events for a viewer, until the browser disconnects; bytes from it are ignored."""
         if len(self._viewers) >= _VIEWERS:
             await request.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{_VIEWERS} viewers at most")
             return
@@ -155,7 +155,7 @@ class Site(Gate):
             self._page.viewers = len(self._viewers)
 
     async def _send_all(self) -> None:
-        """Send each viewer the changes since its version; a viewer that does not read gets the newest state later."""
+        """Send each viewer the changes since its version; a viewer that does not read gets the latest state later."""
         beat_s = 0.0
         while True:
             await asyncio.sleep(_PERIOD_S)
@@ -192,9 +192,9 @@ class Site(Gate):
 
 @contextmanager
 def serve_page(title: str, address: Address | None = None) -> Iterator[Page]:
-    """Serve a page while the block runs. Raises `ConfigError` for an unusable address or without the extra `viz`.
+    """Serve a page while the block runs. Raises `ConfigError` if the address is unusable or the extra `viz` is missing.
 
-    Without an address, only this computer is served, at port 8080 or, if that is taken, at another one.
+    Without an address, only this computer can open the page, on port 8080 or, if that is taken, on another one.
     """
     page = Page(title)
     try:
@@ -215,7 +215,7 @@ def _reached_at(host: str) -> str:
     if host not in ("0.0.0.0", "::"):
         return host
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
-        # This sends nothing: an address for documentation selects the interface.
+        # Nothing is sent: an address reserved for documentation only selects the interface.
         probe.connect(("192.0.2.1", 9))
         return str(probe.getsockname()[0])
     return socket.gethostname()
@@ -223,13 +223,13 @@ def _reached_at(host: str) -> str:
 
 @contextmanager
 def announce_page(page: Page, address: Address | None, print_page: Callable[..., object]) -> Iterator[None]:
-    """Print the address of a page, with a QR code for other devices if shared; else open it if there is a screen."""
+    """Print a page's address, with a QR code for other devices if it is shared; else open it if there is a screen."""
     shared = address is not None and not is_loopback(address[0])
     print_page(page.url, shared=shared)
     if shared or (sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))):
         yield
         return
-    # As an argument of the browser, the address would be visible in `ps`. Only the owner may enter the folder.
+    # An address given to the browser as an argument would be visible in `ps`. Only the owner can enter the folder.
     with TemporaryDirectory(prefix="ftdrive-", ignore_cleanup_errors=True) as folder:
         file = Path(folder, "page.html")
         file.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={escape(page.url)}">')
@@ -239,7 +239,7 @@ def announce_page(page: Page, address: Address | None, print_page: Callable[...,
 
 @cache
 def _files() -> dict[str, Path]:
-    """Return the files of a page by their address: the shell, and those of the package uPlot, which is not imported."""
+    """Return a page's files by their address: the shell, and those of the package uPlot, which is not imported."""
     shell = Path(__file__).parent / "shell"
     files: dict[str, Path] = {f"/{file.name}": file for file in shell.iterdir() if file.suffix in _TYPES}
     files["/"] = files.pop("/page.html")
