@@ -113,7 +113,7 @@ def _side(text: str) -> _Side:
 
 
 def _sensors(a: _Side, b: _Side) -> tuple[str, str] | None:
-    """Return the sources of the sensor errors under contact in A and B; None if they are equal or unknown."""
+    """Return where the sensor errors under contact come from in A and B; None if they are equal or unknown."""
     first, second = a.calibrated, b.calibrated
     # A result from the store has no sensor matrix.
     if not (isinstance(first, CalibrationResult) and isinstance(second, CalibrationResult)):

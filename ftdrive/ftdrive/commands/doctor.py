@@ -37,7 +37,7 @@ from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import answer, indented, messages, working
 from ftdrive.terminal.text import echo
 
-# Checks that a summary shows for robot, sensor and noise; for other subjects, the first one that passed.
+# Checks that the summary shows for robot, sensor and noise; for other subjects, it shows the first that passed.
 _HEADLINES = ("robot.identity", "sensor.identity", "noise.accuracy")
 _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "red"), "skipped": ("-", "")}
 
@@ -146,7 +146,7 @@ def _print_checks(found: list[Check], *, every: bool) -> None:
 
 
 def _attention_only(checks: list[Check]) -> list[Check]:
-    """Return the checks that need attention, after one that names the subject, with the number of passed checks."""
+    """Return the checks that need attention, after one that identifies the subject and counts the passed checks."""
     passed = [check for check in checks if check.state == "ok"]
     first = [check for check in passed if check.name in _HEADLINES][:1] or passed[:1] or checks[:1]
     if first[0].state == "ok" and len(passed) > 2:

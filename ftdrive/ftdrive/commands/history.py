@@ -19,11 +19,11 @@ from ftdrive.terminal.console import answer, indented, messages
 from ftdrive.terminal.text import echo, print_table
 from ftdrive.words.history import DAY_TITLES, day_row, last_weighing_in_words, result_table, temperature_lines
 
-# With fewer records than this there cannot be three pairs of runs, and importing numpy takes as long as the rest.
+# Fewer records cannot make three pairs of runs, so numpy, whose import takes as long as the rest, is not imported.
 _FEWEST_RUNS = 4
 _HOUR = "bias, {sensor_serial}: changes by {force_N:.2g} N, {torque_Nm:.2g} N·m per axis within an hour (1 sigma)"
 _MOUNTED = ("sensor_serial", "arm_serial", "mount")
-# Largest number of days of weighings in the list.
+# Largest number of days with weighings in the list.
 _MOST_DAYS = 20
 # Weighings older than this are not shown as the last ones.
 _RECENT = timedelta(days=90)

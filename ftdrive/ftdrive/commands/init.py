@@ -1,4 +1,4 @@
-"""`ftdrive init`: ask for a description of the cell, and write it to a file. Nothing moves."""
+"""`ftdrive init`: ask for a description of the cell and write it to a file. Nothing moves."""
 
 from pathlib import Path
 from shlex import quote

@@ -129,7 +129,7 @@ def live(
         if (page := stack.enter_context(view.page(title))) is not None:
             certifier = certifier_of(stream, replay, messages.print)
             shown = LivePage(page, feed, checks, certifier, controls=allow_control)
-            # the full screen hides printed messages
+            # the full screen would hide printed messages
             say = partial(feed.note, kind="failed") if full_screen else messages.print
             stack.enter_context(drawing(page, shown.draw, say))
         if full_screen:

@@ -1,4 +1,4 @@
-"""Options that several commands share, as `click` parameters, and the objects built from them."""
+"""Options shared by several commands, as `click` parameters, and the objects built from them."""
 
 import importlib.util
 import json
@@ -123,23 +123,23 @@ CONFIG = click.option("--config", type=FILE, help="TOML file that describes the 
 
 @dataclass(frozen=True, slots=True)
 class CellOptions:
-    """Options that describe a cell. A run stores them, so that it is resumed with the same values."""
+    """Options that describe a cell. A run stores them, so that it can be resumed with the same values."""
 
     config: Path | None = None
     robot: str | None = None
     sensor: str | None = None
     tool: tuple[str, ...] = ()
-    """Cylinders around tool and sensor."""
+    """Cylinders around the tool and the sensor."""
     control: str | None = None
     model: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the options stored in run.json."""
+        """Return the options to store in run.json."""
         kept = ("config", "robot", "sensor", "tool", "control")
         return {name: getattr(self, name) for name in kept} | {"config": self.config and str(self.config)}
 
     def _or_those(self, begun: Mapping[str, Any]) -> "CellOptions":
-        """Return these options, completed by those of a run from `to_dict`; a missing file is ignored."""
+        """Return these options, completed with those that a run stored by `to_dict`; a missing file is ignored."""
         config = Path(begun["config"]) if begun.get("config") else None
         return CellOptions(
             self.config or (config if config is not None and config.is_file() else None),
@@ -150,7 +150,7 @@ class CellOptions:
         )
 
     def settings(self) -> dict[str, Setting]:
-        """Return the settings from options, environment and files, in this order; see `cell.config.settings`."""
+        """Return the settings from options, environment and files, in order of priority; see `cell.config.settings`."""
         flags = {
             "robot.host": ("--robot", self.robot),
             "robot.model": ("--model", self.model),
@@ -161,13 +161,13 @@ class CellOptions:
         return settings(self.config, flags)
 
     def cell(self, *, sensor_alone: bool = False) -> CellConfig:
-        """Return the cell. With `sensor_alone`, a given --sensor needs no robot; the host may then be empty."""
+        """Return the cell. With `sensor_alone`, no robot is needed if --sensor is given; the host may then be empty."""
         values = self.settings()
         needs_robot = not sensor_alone or self.sensor is None or values["robot.host"].value is not None
         return cell_of(values, devices=needs_robot)
 
     def sensor_alone(self) -> CellConfig:
-        """Return the cell of a sensor; no settings of the arm are required."""
+        """Return a cell with only a sensor; no settings of the arm are required."""
         cell = cell_of(self.settings(), devices=False)
         if not cell.sensor.url:
             raise ConfigError("no sensor: give --sensor URL, or --simulate; see `ftdrive devices --probe PLACE`")
@@ -176,7 +176,7 @@ class CellOptions:
     def cell_to_resume(self, folder: Path, header: Mapping[str, Any], say: Callable[[str], object]) -> CellConfig:
         """Return the cell of a resumed run with this header; options given now replace those of the run.
 
-        Files and environment describe the present tool and surroundings; the session refuses to continue if they differ
+        Files and environment describe the current tool and surroundings; the session refuses to continue if they differ
         from those of the plan. If no file describes them, the record of the run is used. `say` receives a sentence
         about the source.
         """
@@ -236,7 +236,7 @@ BAG_TOPICS = _combined(
 
 
 class Number(click.FloatRange):
-    """A finite number within a range; `click` alone accepts nan."""
+    """A finite number within a range; `click` alone would accept nan."""
 
     name = "number"
 
@@ -252,7 +252,7 @@ POSITIVE = Number(0, min_open=True)
 
 
 def require_extra(extra: str, what: str, *modules: str) -> None:
-    """Raise `ConfigError` before any work if a package in `modules`, part of an extra, is missing for `what`."""
+    """Raise `ConfigError` before any work if `what` needs a missing package: one of `modules`, part of an extra."""
     from ftdrivers.installation import missing_extra
 
     if missing := [name for name in modules if importlib.util.find_spec(name) is None]:
@@ -261,7 +261,7 @@ def require_extra(extra: str, what: str, *modules: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ViewOptions:
-    """Whether a command has a page in the browser, and its address."""
+    """Whether a command shows a page in the browser, and the address of the page."""
 
     view: bool
     address: str | None
@@ -272,7 +272,7 @@ class ViewOptions:
         return self.view or self.address is not None
 
     def require(self, *, once: bool = False, allow_control: bool = False) -> None:
-        """Raise `ConfigError` for options that would be ignored, or if a package for the page is missing."""
+        """Raise `ConfigError` for options that would have no effect, or if a package for the page is missing."""
         if once and self.wanted:
             raise ConfigError("--view cannot be combined with --once: leave one of the two out")
         if allow_control and not self.wanted:
@@ -316,7 +316,7 @@ def view_options(command: F) -> F:
 
 
 class NewFile(click.Path):
-    """A new file. It is rejected before any work if it exists or its folder does not."""
+    """A new file. It is rejected before any work if it already exists or its folder does not."""
 
     def __init__(self) -> None:
         super().__init__(dir_okay=False, path_type=Path)
@@ -354,7 +354,7 @@ EMULATED_SENSOR = click.option("--sensor", metavar="emulated://NAME", help="With
 def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated: Mapping[str, object] = {}) -> None:
     """Raise `ConfigError` for an option that --simulate excludes, or that needs --simulate.
 
-    `real` and `emulated` map options to values; None, False and empty values mean that the option is not given.
+    `real` and `emulated` map options to values; None, False or an empty value means that the option is not given.
     """
     if given := [option for option, value in (real if simulate else emulated).items() if value]:
         fix = "leave one of the two out" if simulate else "add --simulate, or leave it out"
@@ -362,7 +362,7 @@ def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated:
 
 
 class SourceOptions(NamedTuple):
-    """Cell and calibration of a compensated stream, from the options of `SOURCE`."""
+    """Cell and calibration for a compensated stream, from the options of `SOURCE`."""
 
     path: Path | None
     tool: str | None
@@ -371,7 +371,7 @@ class SourceOptions(NamedTuple):
     simulate: bool
 
     def calibration(self) -> "CalibrationResult | None":
-        """Return the calibration, read or made in the emulated cell; None for a tool or without options."""
+        """Return the calibration, read from a file or made in the emulated cell; None for a tool or without options."""
         from ftdrive.runs.calibration import read_calibration
         from ftdrive.session.rehearsal import short_calibration
         from ftdrive.terminal.screen import open_operator
@@ -383,9 +383,9 @@ class SourceOptions(NamedTuple):
     def stream(
         self, cell: CellConfig | None, calibration: "CalibrationResult | None", tool: str | None, **options: Any
     ) -> "Stream":
-        """Return the unopened stream of a cell, or of an emulated one; a tool replaces the calibration.
+        """Return the stream of a cell or of an emulated one, not opened yet; a tool replaces the calibration.
 
-        Raises `ConfigError` without a calibration and a tool. `options` are passed to `open_stream`.
+        Raises `ConfigError` if there is neither a calibration nor a tool. `options` are passed to `open_stream`.
         """
         from ftdrive.library import open_stream
         from ftdrive.session.rehearsal import station_of
@@ -404,7 +404,7 @@ class SourceOptions(NamedTuple):
     def open(
         self, stack: ExitStack, frame: "WrenchFrame", track: "Tracking" = "off", stages: Mapping[str, Any] = {}
     ) -> "Stream":
-        """Open the stream with these stages, until `stack` closes it; print state and warnings."""
+        """Open the stream with these stages until `stack` closes it; print its state and warnings."""
         from ftdrive.terminal.console import messages
 
         calibration = self.calibration()
@@ -419,7 +419,7 @@ class SourceOptions(NamedTuple):
         return stream
 
     def require_alone(self, others: Mapping[str, object]) -> None:
-        """Raise `ConfigError` for given options that need an arm or a calibration, including `others`."""
+        """Raise `ConfigError` if options are given that need an arm or a calibration, including `others`."""
         own = {"--calibration": self.path, "--tool": self.tool, "--robot": self.described.robot}
         if given := [option for option, value in {**own, **others}.items() if value]:
             raise ConfigError(
@@ -455,7 +455,7 @@ class SourceOptions(NamedTuple):
 
 
 def SOURCE(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options for cell and calibration, and pass them to the command as one `SourceOptions`."""
+    """Add the options for the cell and the calibration, and pass them to the command as one `SourceOptions`."""
 
     @wraps(command)
     def with_source(**options: Any) -> None:
@@ -539,7 +539,7 @@ STORE = click.option("--store", "url", metavar="URL", help="Database to use, ins
 
 @contextmanager
 def declined_aborts() -> Iterator[None]:
-    """Print the reason why the operator ended a session, and abort the command."""
+    """Print why the operator ended a session, and abort the command."""
     from ftdrive.terminal.console import messages
 
     try:
@@ -600,7 +600,7 @@ TABLE_NAMES = ("columns", "rate", "euler", "tcp", "wrench_frame", "sign", "model
 
 
 def TABLE(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of a table, and pass them to the command as `TableOptions`, or None if none is given."""
+    """Add the options of a table, and pass them to the command as `TableOptions`, or as None if none is given."""
 
     @wraps(command)
     def with_table(**options: Any) -> None:
@@ -617,7 +617,7 @@ REPORTED = ("method", "orientation", "drift", "mass_kg", "level_deg", "mounting_
 
 
 def typed_options(context: click.Context, names: Sequence[str] | None = None) -> tuple[str, ...]:
-    """Return the given options as words for a shell, limited to `names`."""
+    """Return the options that were given, as words for a shell; only those in `names` if it is not None."""
     words = list[str]()
     for one in context.command.params:
         is_given = one.name is not None and context.get_parameter_source(one.name) is not ParameterSource.DEFAULT

@@ -159,7 +159,7 @@ def plan_command(
         cell = replace(cell, clock=emulated.clock)
     described = {found[key].origin for key in ("tool.cylinders_mm", "workcell.planes_mm", "workcell.boxes_mm")}
     described -= {"default", "--tool", "--plane", "--box"}
-    if not described:  # only options, or arm and mounting alone
+    if not described:  # there are only options, or only arm and mounting
         cell = replace(cell, workcell=replace(cell.workcell, measured=True))
     if not cell.workcell.measured:
         messages.print(

@@ -14,7 +14,7 @@ _ROS_ARGS = "--ros-args"
 
 
 class _RosCommand(click.Command):
-    """Command that passes the arguments from `--ros-args` on to ROS instead of click."""
+    """A command that passes `--ros-args` and all arguments after it to ROS instead of click."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         start = args.index(_ROS_ARGS) if _ROS_ARGS in args else len(args)

@@ -1,4 +1,4 @@
-"""`ftdrive serve-load`: provide weight and contact wrench to the program on the controller."""
+"""`ftdrive serve-load`: provide the weight and the contact wrench to the program on the controller."""
 
 from contextlib import ExitStack
 from functools import partial

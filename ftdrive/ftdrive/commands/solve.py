@@ -54,7 +54,7 @@ _EPILOG = "\b\nMETHOD is one of\n" + fill(
     ", ".join(_METHODS), 76, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
 )
 
-# Options that only control what happens to a result.
+# Options that control only what happens to a result.
 _SAVING = ("output", "force", "every", "as_json")
 HEADINGS = {
     "How to solve": "--method --as-published --drift --from --together --point-mass",
@@ -155,7 +155,7 @@ def _poses_of(test: Path, options: SolveOptions) -> CalibrationDataset:
 
 
 def _rehearsed_folder(sensor: str | None, method: str, *, cases: bool) -> AbstractContextManager[Path]:
-    from ftdrive.session.rehearsal import rehearsed_run  # imports drivers and screen
+    from ftdrive.session.rehearsal import rehearsed_run  # this imports the drivers and the screen
     from ftdrive.terminal.screen import open_operator
 
     poses = {"poses": 24 if method in (*SPECIAL, "all") else 6, "method": "ml" if method == "all" else method}
@@ -170,7 +170,7 @@ def _solve_each(
 ) -> None:
     first_failure: AcceptanceError | DataError | None = None
     for source in sources:
-        # A source that fails does not prevent the others from being solved.
+        # If a source fails, the others are still solved.
         try:
             with unpack(source) as place:
                 show(options, as_json, source, place)
@@ -180,7 +180,7 @@ def _solve_each(
             first_failure = first_failure or error
             if as_json and not isinstance(error, NotAccepted):
                 write_json({"schema_version": 1, "source": str(source), "error": str(error)})
-            # Errors of files contain the file's name, but not its folder; errors of a solution contain neither.
+            # An error about a file contains its name, but not its folder; an error about a solution contains neither.
             is_named = isinstance(error, DataError) and [one.name for one in sources].count(source.name) == 1
             echo(in_one_line(f"error: {error}" if is_named else f"error: {source}: {error}"), err=True)
     if first_failure is not None:

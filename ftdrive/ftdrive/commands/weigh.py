@@ -82,7 +82,7 @@ def weigh_command(
         on_screen = not (once or as_json) and has_screen()
         if (page := stack.enter_context(view.page("ftdrive weigh"))) is not None:
             shown = WeighPage(page, weighing, controls=allow_control)
-            # the full screen hides printed messages, and has a line for notes
+            # the full screen would hide printed messages, but has a line for notes
             say = partial(setattr, weighing, "note") if on_screen else messages.print
             stack.enter_context(drawing(page, shown.draw, say))
         if on_screen:

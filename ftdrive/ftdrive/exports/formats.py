@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
-# Properties of a calibration: tilted base; rotated sensor; gain and cross-talk of the sensor.
+# Properties of a calibration: a tilted base, a rotated sensor, gain and cross-talk of the sensor.
 Property = Literal["tilt", "rotation", "response"]
 Comment = Literal["#", "# at the end", "<!-- -->", "none"]
 
-# Largest accepted force error, N, of an export format that cannot represent the whole calibration.
+# Largest force error, N, accepted from an export format that cannot represent the whole calibration.
 MAX_FORCE_ERROR_N: Final = 0.1
 # Gravity in mc_rtc/constants.h. The force must be right, so the exported mass differs by up to 0.3 %.
 MC_RTC_G_M_S2: Final = 9.80665
@@ -20,7 +20,7 @@ _SPELLED: Final = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x"
 
 
 def plain_ascii(text: str) -> str:
-    """Return text as printable ASCII without quotes and backslashes: URScript strings have no escapes."""
+    """Return text as printable ASCII without quotes or backslashes, because URScript strings have no escapes."""
     return "".join(c if " " <= c <= "~" and c not in "\"'\\" else "?" for c in text.translate(_SPELLED))
 
 
@@ -34,7 +34,7 @@ class ExportFormat:
     subtracts: tuple[Literal["bias", "weight"], ...] = ("bias", "weight")
     """What the target subtracts from the reading."""
     expresses: tuple[Property, ...] = ("tilt", "rotation")
-    """Properties of the calibration that the target can express; for response see `has_own_reading`."""
+    """Properties of the calibration that the target can express; for "response", see `has_own_reading`."""
     comment: Comment = "#"
     """Form of the header comment."""
     content: Any = None
@@ -46,11 +46,11 @@ class ExportFormat:
     notes: tuple[str, ...] = ()
     """Sentences for the user of the target, with values in braces."""
     elsewhere: Mapping[str, str] = field(default_factory=dict)
-    """Values that the target reads from another place, by their names there, with "$name" as in `content`."""
+    """Values that the target reads from another place, by their names in that place, with "$name" as in `content`."""
 
     @property
     def has_own_reading(self) -> bool:
-        """Whether the target reads another sensor or none, so bias and response of this sensor do not matter."""
+        """Whether the target reads another sensor or none, so that bias and response of this one do not matter."""
         return "bias" not in self.subtracts and "response" in self.expresses
 
 
@@ -92,7 +92,7 @@ _OFFSET: Final = (
 _WORLD: Final = "Gravity is in axes of {base_frame}, {base_axes}: rotate it if the axes of the world differ."
 _OWN_READING: Final[tuple[Property, ...]] = ("tilt", "rotation", "response")
 
-# By name, as in `--format`. Above each row: project, file and version of the reader, and its formula.
+# The formats by name, as in `--format`. Above each: project, file and version of the reader, and its formula.
 FORMATS: Mapping[str, ExportFormat] = {
     # kth-ros-pkg/force_torque_tools, gravity_compensation/src/gravity_compensation_node.cpp and
     # gravity_compensation.cpp, master since pull request 18 (2021-05). a is the acceleration that its IMU reports,

@@ -1,4 +1,4 @@
-"""Writer of the formats in `formats.py` and of the complete JSON and YAML; it also computes the error of a target."""
+"""Writes the formats in `formats.py` and the complete JSON and YAML, and computes the error of a target."""
 
 import json
 import re
@@ -37,7 +37,7 @@ _FIELDS = (
 )
 
 
-# A name is also valid inside an XML comment, where `--` is an error.
+# A name must also be valid inside an XML comment, where `--` is an error.
 _NAME = re.compile(r"[A-Za-z_](-?[A-Za-z0-9_./])*")
 # From ur_description/urdf/ur_macro.xacro, joint base_link-base_fixed_joint: 180° about z. ROS users have base_link;
 # without this rotation a tilt would be wrong without a message.
@@ -48,7 +48,7 @@ _R_FLANGE_TOOL0 = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Names and measured values; None if not measured. Raises `ConfigError` for a name that is invalid in files."""
+    """Names, and measured values or None. Raises `ConfigError` for a name that is invalid in files."""
 
     base_frame: str = "base"
     """Frame of the controller's base, or `base_link` of a UR in ROS, with any prefix."""
@@ -79,7 +79,7 @@ class Settings:
 
 
 def recorded_sensor(path: Path, calibration: CalibrationResult) -> tuple[float | None, float | None]:
-    """Return height (mm) and mass (kg) of the sensor configured for a calibration, file or run; None if unknown."""
+    """Return the sensor's height (mm) and mass (kg) configured for a calibration, file or run; None if unknown."""
     folder = path if path.is_dir() else path.resolve().parent
     if path.is_dir() or (folder.name == calibration.provenance.get("run") and is_run(folder)):
         sensor = Run(folder).header().get("config", {}).get("sensor", {})
@@ -96,7 +96,7 @@ def _yaml(document: Any) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Values:
-    """Values of an export by name: from `_VALUES`, the calibration or the settings, in the unit of the name.
+    """Values for an export by name, from `_VALUES`, the calibration or the settings, in the unit that the name states.
 
     Raises `ConfigError` for a value that was not measured.
     """
@@ -119,7 +119,7 @@ class _Values:
         return (np.ravel(value) + 0.0).tolist() if isinstance(value, np.ndarray) else value
 
     def filled(self, node: Any) -> Any:
-        """Return a part of a row with its values filled in."""
+        """Return a part of a document with its values filled in."""
         if isinstance(node, Mapping):
             return {key: self.filled(value) for key, value in node.items()}
         if isinstance(node, list):
@@ -128,7 +128,7 @@ class _Values:
 
     @property
     def is_turned(self) -> bool:
-        """Whether the base frame is base_link of ROS."""
+        """Whether the base frame is `base_link` of ROS."""
         return self.settings.base_frame.endswith("base_link")
 
     @property
@@ -160,7 +160,7 @@ class _Values:
 
     @property
     def payload(self) -> FlangeLoad:
-        """Everything that the flange carries."""
+        """The load of everything that the flange carries."""
         height_m = float(self.p_flange_sensor_m[2])
         if self.settings.sensor_mass_kg is None:
             raise ConfigError(
@@ -173,7 +173,7 @@ class _Values:
 
     @property
     def inertia_kg_m2(self) -> Array | None:
-        """Inertia (3, 3) of the tool about its centre of mass, sensor axes; None if not identified, or not physical."""
+        """Inertia (3, 3) of the tool about its centre of mass, sensor axes; None if not identified or not physical."""
         if self.calibration.motion is None:
             return None
         J = self.calibration.motion.inertia_kg_m2
@@ -183,7 +183,7 @@ class _Values:
 
 
 def _rpy_rad(v: _Values) -> Array:
-    """Return roll, pitch, yaw of the sensor as in URDF: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return the sensor's roll, pitch and yaw as in URDF: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     with warnings.catch_warnings():
         # at a pitch of 90 degrees, roll is set to zero
         warnings.simplefilter("ignore")
@@ -191,7 +191,7 @@ def _rpy_rad(v: _Values) -> Array:
 
 
 def _quaternion(v: _Values) -> Array:
-    """Return the orientation of the sensor as a quaternion, scalar last and not negative."""
+    """Return the orientation of the sensor as a quaternion, with the scalar last and not negative."""
     return Rotation.from_matrix(v.R_frame_sensor).as_quat(canonical=True)
 
 
@@ -233,7 +233,7 @@ def _assumption_note(v: _Values) -> str:
 
 
 _DIAGONAL_FIRST: Final = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
-# Suffixes of names for values in a certain form.
+# Suffixes of names that give a value a certain form.
 _FORMS: Mapping[str, Callable[[Any], Any]] = {
     "xyz": lambda value: dict(zip("xyz", value, strict=True)),  # ROS messages have vectors in this form
     "words": lambda value: ", ".join(map(str, value)),
@@ -273,20 +273,20 @@ _VALUES: Mapping[str, Callable[[_Values], Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """The text for one target, with what its user must know."""
+    """The text for one target, and what its user must know."""
 
     text: str
     notes: tuple[str, ...]
     """Sentences for the user of the target."""
     elsewhere: Mapping[str, JSON]
-    """Values that the target reads from another place, by their names there."""
+    """Values that the target reads from another place, by their names in that place."""
     max_force_error_N: float
     """Largest difference from `CalibrationResult.compensate` of a free tool over all orientations, N."""
     max_torque_error_Nm: float
 
 
 def _compensation_document(calibration: CalibrationResult, settings: Settings) -> dict[str, JSON]:
-    """Return everything that compensation needs, for a program of the user.
+    """Return everything that the user's own program needs for the compensation.
 
     With u = R_flange_sensor^T R_base_flange^T gravity_force_base_N, the weight in the sensor frame, and zeros without
     `response`:
@@ -320,12 +320,12 @@ def _compensation_document(calibration: CalibrationResult, settings: Settings) -
 
 
 _STEPS = 500
-# Relative increase per step, over all starts, below which the ascent has converged.
+# The ascent has converged if no start increases by more than this relative amount in a step.
 _CONVERGED = 1e-12
 
 
 def _compensations(calibration: CalibrationResult, target: ExportFormat) -> tuple[Compensator, Compensator]:
-    """Return the compensation of a free tool by ftdrive, and by a target that lacks what its `expresses` does not list.
+    """Return how ftdrive compensates a free tool, and how a target does that can express only what `expresses` lists.
 
     Without tilt, gravity points along -z of the base. Without rotation, the sensor axes equal the flange axes. If the
     target reads another sensor or none, the response of this sensor is left out of both.
@@ -360,9 +360,9 @@ def _largest_norm(matrix: Array, offset: Array) -> float:
 def export_calibration(
     calibration: CalibrationResult, name: str, settings: Settings, *, max_force_error_N: float = MAX_FORCE_ERROR_N
 ) -> Exported:
-    """Return a calibration as text for the target of this name in `FORMATS`.
+    """Return a calibration as a text for the target with this name in `FORMATS`.
 
-    In any orientation, the target may differ from `CalibrationResult.compensate` by `max_force_error_N`. Raises
+    In any orientation, the target may differ from `CalibrationResult.compensate` by up to `max_force_error_N`. Raises
     `ConfigError` if a value was not measured, and `NotAccepted` if the calibration is rejected or the target differs by
     more.
     """
@@ -425,7 +425,7 @@ def _lost(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]
 
 
 def _undecoded(name: str, calibration: CalibrationResult) -> Iterator[str]:
-    """Yield a note with the largest error of a contact if the target does not decode it."""
+    """Yield a note with the largest error of a contact force if the target cannot decode contacts."""
     if (decoder := calibration.contact.decoder) is None:
         return
     at_tool = np.concatenate([np.eye(3), skew(calibration.p_sensor_com_m)])

@@ -23,7 +23,7 @@ _FASTEST_RAD_S, _FASTEST_RAD_S2 = pi + 1e-9, radians(300) + 1e-9
 
 
 def plan_table(plan: Plan) -> str:
-    """Return one line per pose, with speed, acceleration and clearance of the move to the next (last: first).
+    """Return one line per pose, with speed, acceleration and clearance of the move to the next one (finally the first).
 
     The first line is a comment with the format, the plan's hash, the model, and whether the cell was emulated.
     """
@@ -156,8 +156,8 @@ def _cylinder(part: dict[str, Any]) -> str:
 
 
 def _require_exportable(plan: Plan) -> None:
-    """Raise `PlanRefused` for sweeps, placeholders, moves that are not proven clear, and values no arm can reach."""
-    # The exported text contains no verdict, so plans that are not proven are not exported.
+    """Raise `PlanRefused` for sweeps, placeholders, moves not proven clear, and values that no arm can reach."""
+    # The exported text has no room for a verdict, so plans that are not proven clear are not exported.
     if plan.sweep is not None:
         raise PlanRefused("this plan is a sweep, which no other program can follow: export the plan of a tour")
     if not plan.measured:
@@ -177,7 +177,7 @@ def _require_exportable(plan: Plan) -> None:
         raise PlanRefused("the plan has a joint angle, speed or acceleration that no arm can reach: make a new plan")
 
 
-# Time without a change of the live counter after which the service is taken as stopped, s.
+# If the live counter does not change for this time, s, the service is considered stopped.
 STALE_S: Final = 0.06
 # Time-out of a request, s, and the states of a request without an answer.
 LIMIT_S: Final = 2.0
@@ -185,7 +185,7 @@ GONE, LATE, UNSEEN = -1, -2, -3
 
 
 def functions(first: int, *, example: bool = False) -> str:
-    """Return the functions for registers from `first` on, as in `serve-load --first`.
+    """Return the functions for registers starting at `first`, as in `serve-load --first`.
 
     With `example`, append a program that weighs a part and sets the payload.
     """

@@ -1,1 +1,1 @@
-"""Texts of results, sessions, streams and weighings: pure functions, and the view models of screens and pages."""
+"""Texts for results, sessions, streams and weighings: pure functions, and the view models for screens and pages."""

@@ -1,4 +1,4 @@
-"""Contents of the store as table rows and lines: results, their trends, weighings."""
+"""Contents of the store as table rows and lines of text: results, their trends, weighings."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
@@ -13,12 +13,12 @@ from ftdrive.store.history import age_days
 from ftdrive.store.records import StoredResult
 from ftdrive.words.text import GLUE
 
-if TYPE_CHECKING:  # a list of results needs no numpy
+if TYPE_CHECKING:  # listing results must not import numpy
     from ftcalib.after.series import BiasTemperature
 
 DAY_TITLES = ("day", "arm", "tool", "parts", "refused", "last, UTC", "mass", "file")
 _TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias, N", "run", "°C", "parent")
-# Columns shown only if a result has a value.
+# Columns that are shown only if some result has a value.
 _OPTIONAL = {"°C", "parent"}
 
 
@@ -30,7 +30,7 @@ def tool_in_words(tool: str | None, *, emulated: bool) -> str:
 
 
 def last_weighing_in_words(one: WeighingDay) -> str:
-    """Return tool, time and mass of the last part of a day, and the number of parts."""
+    """Return the tool, the time and the mass of a day's last part, and the number of parts."""
     counts = f"{counted(one.weighings, 'part')}, {sum(one.refusals.values())} refused on this day"
     time = one.day if one.last_utc is None else one.last_utc[:16].replace("T", " ")
     return f"{tool_in_words(one.tool, emulated=one.emulated)}, {time}: {_mass_in_words(one)}; {counts}"
@@ -56,7 +56,7 @@ def _mass_in_words(one: WeighingDay) -> str:
 
 
 def day_row(one: WeighingDay) -> tuple[str, ...]:
-    """Return the weighings of a day as a row for `DAY_TITLES`."""
+    """Return the weighings of a day as a row of the table with `DAY_TITLES`."""
     return (
         one.day,
         one.arm_serial or one.robot_host or "-",
@@ -72,7 +72,7 @@ def day_row(one: WeighingDay) -> tuple[str, ...]:
 def result_table(
     results: Iterable[StoredResult], last: Mapping[str, VerificationRecord], now: datetime
 ) -> tuple[Sequence[str], Sequence[Sequence[str]]]:
-    """Return titles and rows of a table of results; `last` has the last verification of each result by its id."""
+    """Return the titles and rows of a table of results; `last` maps the id of a result to its last verification."""
     rows = [_history_row(one, last.get(one.id), now) for one in results]
     shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]
     return [_TITLES[n] for n in shown], [[row[n] for n in shown] for row in rows]

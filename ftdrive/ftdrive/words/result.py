@@ -15,9 +15,9 @@ from ftdrive.runs.pose_hints import find_moved, hints, pose_names
 from ftdrive.runs.verification import FALSE_ALARMS, Verified
 from ftdrive.words.text import TextLine
 
-# Number of findings shown, so that verdict, findings and next command fit on one screen.
+# Largest number of findings shown, so that verdict, findings and next command fit on one screen.
 _MOST_FINDINGS = 3
-# An error elsewhere or later is shown if it is larger by this factor.
+# An error elsewhere or later is shown if it is larger by more than this factor.
 _WORSE = 1.2
 _ELSEWHERE: Sequence[tuple[str, Literal["workspace", "hour"]]] = (
     ("in any orientation", "workspace"),
@@ -34,7 +34,7 @@ SIGMA_OF_THE_TOOL = (
 def estimate_rows(
     document: Mapping[str, Any], truth: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[str, int, str, str, str, str]]:
-    """Yield each number in the JSON of a result: key, axis, name with unit, true value if known, value, sigma."""
+    """Yield for each number in a result's JSON: key, axis, name with unit, true value if known, value, sigma."""
     for one in shown_estimates(document):
         label, scale, unit, key, values, sigmas, fixed = one
         truths = values_of(truth[key], key) * scale if truth is not None and key in truth else None
@@ -46,7 +46,7 @@ def estimate_rows(
 
 
 def mass_in_words(result: CalibrationResult) -> str | None:
-    """Return the mass with both parts of its sigma; None if the mass was known, or the sensor is declared perfect."""
+    """Return the mass with both parts of its sigma; None if the mass was given or the sensor is declared perfect."""
     session_kg = result.parameters.weight_sigma_N(result.covariance) / result.g_m_s2
     if session_kg < _ROUNDING * result.mass_kg or result.scale_sigma <= LEAST_COMMON_GAIN:
         return None
@@ -92,7 +92,7 @@ def conclusion(
     hinted: bool = True,
     every: bool = False,
 ) -> list[TextLine]:
-    """Return the conclusion of a result: compensation error, findings and what to do.
+    """Return the conclusion about a result: compensation error, findings and what to do.
 
     Without `every`, include at most three findings that need an action, one per code, so that verdict and next command
     stay on one screen.
@@ -102,11 +102,11 @@ def conclusion(
     result : CalibrationResult
     drift : DriftCheck, optional
     records : sequence of PoseRecord
-        Names of the poses, and explanations of bad fits.
+        Records, to name the poses and explain bad fits.
     hinted : bool
         Include hints about what to check in the cell.
     every : bool
-        Include everything: all findings, residuals, contents of sigma.
+        Include everything: all findings, the residuals, what sigma includes.
     """
     lines = [TextLine("", f"compensation error {error_in_words(result)}")]
     if every:
@@ -160,7 +160,7 @@ def _two_digits(value: float) -> str:
 
 
 def sensor_in_words(result: CalibrationResult) -> str:
-    """Return the source of the sensor errors under contact."""
+    """Return where the sensor errors under contact come from."""
     sensor = result.sensor
     if sensor is None or sensor.source == "assumed":
         return "assumed, not measured"
@@ -171,13 +171,13 @@ def sensor_in_words(result: CalibrationResult) -> str:
 
 
 def contact_in_words(result: CalibrationResult) -> str:
-    """Return sigma of a contact force at the tip, and its source."""
+    """Return the sigma of a contact force at the tip, and where the sensor errors in it come from."""
     sigma_N = float(force_sigma_at_tip(result))
     return f"{CONTACT_N:g} N at the tip ± {sigma_N:.2g} N (1 sigma); errors of the sensor are {sensor_in_words(result)}"
 
 
 def drift_in_use(result: CalibrationResult) -> str | None:
-    """Return how the bias changes after the last pose; None without drift, and in motion."""
+    """Return how the bias changes after the last pose; None without drift, or for a calibration in motion."""
     growth = np.array(result.quality.get("bias_growth_per_min", ()))
     if result.mean_bias is None or not growth.size:
         return None
@@ -201,7 +201,7 @@ def _poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str
 
 
 def truth_in_words(result: CalibrationResult, truth: Mapping[str, Any]) -> str:
-    """Return the reading of a free tool in a known cell after compensation, and before."""
+    """Return the readings of a free tool in a known cell, after and before compensation."""
     left = compensation_error(result, truth)
     return (
         f"a free tool reads {left['force_rms_N']:.4f} N, {left['torque_rms_Nm']:.5f} N·m rms; "
@@ -210,7 +210,7 @@ def truth_in_words(result: CalibrationResult, truth: Mapping[str, Any]) -> str:
 
 
 def residuals_in_words(result: CalibrationResult) -> str:
-    """Return the residuals of the fit as text."""
+    """Return a text with the residuals of the fit."""
     residual = result.to_dict()["residual"]
     return (
         f"force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
@@ -219,7 +219,7 @@ def residuals_in_words(result: CalibrationResult) -> str:
 
 
 def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
-    """Return the change of the first pose when repeated at the end, and whether it exceeds the noise."""
+    """Return how the first pose changed when it was repeated at the end, and whether by more than the noise."""
     worst = float(np.max(np.abs(drift.change) / drift.sigma))
     force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
     apart_s = abs(drift.elapsed_s)
@@ -236,7 +236,7 @@ def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
 
 
 def verification_in_lines(verified: Verified, *, every: bool = False) -> list[TextLine]:
-    """Return the lines of a verification: largest differences with the limits, the changes, and what to do."""
+    """Return the lines about a verification: largest differences with the limits, the changes, and what to do."""
     found = verified.verification
     lines = [TextLine("", _verdict_in_words(verified))]
     lines += [] if found.passed else [TextLine("   ", found.reason, "yellow")]

@@ -1,4 +1,4 @@
-"""Texts about a session and a push: plan, questions, estimates, changes; and `SessionView`, the state to show."""
+"""Texts about a session and a push (plan, questions, estimates, changes), and `SessionView`, the state to show."""
 
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -36,7 +36,7 @@ from ftdrive.words.result import drift_in_words
 from ftdrive.words.text import TextLine
 from ftdrivers.interfaces import ControllerSettings
 
-# Label with unit, factor from SI, name, and rank on the screen: higher ranks are omitted first.
+# Label with unit, factor from SI, name, and rank on the screen (higher ranks are omitted first).
 ESTIMATES = (
     ("mass kg", 1.0, "mass_kg", 1),
     ("centre mm", 1e3, "p_sensor_com_m", 2),
@@ -50,7 +50,7 @@ _NUMBER_WIDTH = 9
 # A standard deviation below this, N or N·m, is a rounding error of a value that was not fitted.
 _ROUNDED = 1e-9
 OFF_SIGMA = 5.0
-"""A pose that differs by more standard deviations is an outlier."""
+"""A pose that differs by more standard deviations than this is an outlier."""
 
 _ASCII = str.maketrans(
     dict(zip("┌┐└┘├┤┬┴┼─│━", "+++++++++-|=", strict=True))
@@ -59,9 +59,9 @@ _ASCII = str.maketrans(
 
 
 class SessionText:
-    """Converts events to lines, in sections with headings; without `poses`, the poses get no lines.
+    """Converts events to lines of text, in sections with headings; without `poses`, poses get no lines.
 
-    `verbose` adds a line per check, the table of the plan, and the estimate after each pose. Otherwise passed checks
+    `verbose` adds a line per check, the table of the plan, and the estimate after each pose. Otherwise, passed checks
     share one line, and the plan has three lines.
     """
 
@@ -72,7 +72,7 @@ class SessionText:
         self._passed = list[str]()
 
     def lines(self, event: Event) -> list[TextLine]:
-        """Return the lines to print for an event, preceded by the lines that waited for it."""
+        """Return the lines to print for an event, after the lines that were still pending."""
         if isinstance(event, Checked) and event.passed and not self._verbose:
             heading = [] if self._passed else self._heading("Checks")
             self._passed.append(event.name)
@@ -83,7 +83,7 @@ class SessionText:
         return waiting + self._heading_before(event) + body
 
     def pending(self) -> list[TextLine]:
-        """Return the line with the checks passed so far."""
+        """Return a line with the checks that have passed so far, if there are any."""
         passed, self._passed = self._passed, []
         return [TextLine(" ✔ ", ", ".join(passed), "green")] if passed else []
 
@@ -94,7 +94,7 @@ class SessionText:
                 return self._heading("Plan")
             case Checked():
                 return self._heading("Checks")
-            # a resumed run is opened before its plan is known
+            # a run that is resumed is opened before its plan is known
             case RunOpened() if not self._sections:
                 return []
             case RunOpened() | PoseTaken() | StateChanged(state=State.APPROACH | State.MOVE | State.SWEEP):
@@ -103,7 +103,7 @@ class SessionText:
                 return []
 
     def _heading(self, name: str) -> list[TextLine]:
-        """Return each heading once, because checks after a stop belong to the tour."""
+        """Return each heading only once, because later checks, after a stop, belong to the tour."""
         if name in self._sections:
             return []
         self._sections.append(name)
@@ -153,18 +153,18 @@ def _plan_in_brief(plan: Plan) -> tuple[str, str]:
 
 
 def in_words(event: Event) -> str:
-    """Return the text of an event: several lines for a plan, else one; empty for events that only a screen shows."""
+    """Return the text for an event: several lines for a plan, else one; empty for events that only a screen shows."""
     return "".join(_head_and_words(event))
 
 
 def _head_and_words(event: Event) -> tuple[str, str]:
-    """Return the mark at the start of an event's text, under which its lines are not indented, and the text."""
+    """Return the mark before an event's text, and the text; further lines are indented past the mark."""
     match event:
         case RunOpened():
             return "", f"kept in {event.folder}" + (
                 f"; after a stop, continue with\n{event.resume}" * bool(event.resume)
             )
-        case StateChanged(state=State.HOLD):  # also describes STOP
+        case StateChanged(state=State.HOLD):  # this text also describes STOP
             return "", f"{event.state.upper()}: {event.words}"
         case StateChanged(state=State.PREFLIGHT | State.APPROACH | State.SWEEP | State.CLOSE):
             return "", f"{event.state}{': ' if event.words else ''}{event.words}"
@@ -199,7 +199,7 @@ def _event_sentence(event: Event) -> str:
 
 
 def pose_in_words(event: PoseTaken) -> str:
-    """Return the text of an averaged pose, with the number of its orientation."""
+    """Return the text for an averaged pose, with its orientation number."""
     force_N, torque_Nm = rms_sigma(event.sigma)
     flags = [*["NOT STEADY"] * (not event.steady), *[f"{event.attempts} attempts"] * (event.attempts > 1)]
     settled = f"settled {event.settle_s:.1f} s, {event.samples} samples in {event.average_s:.1f} s"
@@ -217,7 +217,7 @@ def _estimate_in_words(event: Estimated) -> str:
 
 
 def residual_in_words(event: Estimated) -> str:
-    """Return the residual of the newest pose from the previous fit; empty if there is none."""
+    """Return the residual of the newest pose with respect to the previous fit; empty if there is none."""
     if event.residual_sigma is None or event.residual_force_N is None:
         return ""
     return f"{event.residual_force_N:.3f} N from the previous fit, {event.residual_sigma:.1f} sigma"
@@ -230,13 +230,13 @@ def _comparison_in_words(event: Compared) -> str:
 
 
 def differences(event: Compared) -> tuple[str, str, str]:
-    """Return the differences of a pose from the prediction ± expected sigma, N and N·m, and the largest in sigmas."""
+    """Return a pose's differences from the prediction ± expected sigma, N and N·m, and the largest one in sigmas."""
     (N, Nm), (N_sigma, Nm_sigma) = (np.linalg.norm(six.reshape(2, 3), axis=1) for six in (event.residual, event.sigma))
     return f"{N:.3f} ± {N_sigma:.3f}", f"{Nm:.4f} ± {Nm_sigma:.4f}", f"{sigmas_of(event):.1f}"
 
 
 def sigmas_of(event: Compared) -> float:
-    """Return the largest of the six differences divided by its standard deviation."""
+    """Return the largest of the six differences, each divided by its standard deviation."""
     return float(np.max(np.abs(event.residual) / event.sigma))
 
 
@@ -244,7 +244,7 @@ _LEVEL_DEG = 0.05
 
 
 def proposal_in_lines(push: Push) -> list[str]:
-    """Return the lines with old and new values of the controller, and the reasons for and against the change."""
+    """Return lines with the old and new values of the controller, and the reasons for and against the change."""
     lines = _push_table(push)
     if (restored := push.reason.get("restores")) is not None:
         lines.append(f"The new values restore those before {restored}.")
@@ -322,20 +322,20 @@ def _format_vector(value: ArrayLike | None, form: str, scale: float = 1.0) -> st
 
 @dataclass
 class SessionView:
-    """State of a session, as screen and page show it."""
+    """State of a session, as the screen and the page show it."""
 
     command: str = "calibrate"
     now: StateChanged | None = None
     since_s: float = 0.0
-    """Start time of the state, on the clock of the screen."""
+    """Start time of the current state, on the screen's clock."""
     folder: str = ""
     resume: str = ""
     taken: dict[int, tuple[PoseTaken, float]] = field(default_factory=dict)
-    """Poses and their times by stop."""
+    """Poses and their times, by stop."""
     last: PoseTaken | None = None
     estimated: Estimated | None = None
     compared: dict[int, Compared] = field(default_factory=dict)
-    """Comparisons by stop, in a verification."""
+    """In a verification, the comparisons by stop."""
     drift: DriftCheck | None = None
     note: Noted | GuardTripped | None = None
     tripped: bool = False
@@ -366,12 +366,12 @@ class SessionView:
                 self.note, self.tripped = event, True
 
     def shown(self, text: str) -> str:
-        """Return text in the terminal's encoding; the result can be longer, so convert before measuring or cutting."""
+        """Return text that the terminal can encode; it can be longer, so convert before measuring or cutting."""
         return text.translate(_ASCII) if self.ascii_only else text
 
     @property
     def kept(self) -> int:
-        """Number of stored poses; for a resumed run, only the fit knows all of them."""
+        """Number of stored poses; in a resumed run, only the fit knows all of them."""
         return max(len(self.taken), self.estimated.poses if self.estimated else 0)
 
     def _take(self, event: PoseTaken, now_s: float) -> None:
@@ -390,7 +390,7 @@ def progress_in_words(view: SessionView, now_s: float) -> str:
     left = view.last.stops - kept if view.last else 0
     if len(times_s) <= 2 or left <= 0:
         return f"{kept} kept"
-    # median, because a stop with questions takes longer
+    # the median, because a stop with questions takes longer
     usual_s = median(b - a for a, b in pairwise(times_s))
     # during a hold, the remaining time does not shrink
     rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)
@@ -398,12 +398,12 @@ def progress_in_words(view: SessionView, now_s: float) -> str:
 
 
 def state_in_words(view: SessionView, now_s: float) -> tuple[str, str, str]:
-    """Return the position in the session, such as "pose 3/24 R05", its state with duration, and a text about it."""
+    """Return the position in the session, such as "pose 3/24 R05", the state with its duration, and a text about it."""
     now = view.now
     if now is None:
         return "", "recording" if view.folder else "starting", ""
     if view.keys == "asking" and now.state in {State.MOVE, State.SETTLE, State.SAMPLE}:
-        # the motion before the question is complete
+        # the motion before the question has ended
         return "", "WAITS for an answer", ""
     where = "" if now.stop is None else f"pose {now.stop}" + (f"/{now.stops}" if now.stops is not None else "")
     where += f" R{now.number:02d}" if where and now.number is not None else ""
@@ -446,7 +446,7 @@ def drift_so_far(view: SessionView) -> TextLine:
 
 
 def rounded_estimate(fit: Estimated | None, factor: float, name: str) -> tuple[list[str], str]:
-    """Return the values of an estimate times `factor`, and their largest sigma; empty before the first fit."""
+    """Return the values of an estimate times `factor` as texts, and the largest sigma; empty before the first fit."""
     if fit is None or name not in fit.values:
         return [], ""
     value: ArrayLike = fit.values[name]

@@ -1,4 +1,4 @@
-"""State and texts of a stream for screens and pages: a `StreamSummary` makes a `View` of a `Feed`."""
+"""State and texts of a stream for screens and pages: a `StreamSummary` makes a `View` from a `Feed`."""
 
 import json
 from collections import deque
@@ -28,20 +28,20 @@ from ftdrive.stream.weighing import Weighing
 from ftdrivers.interfaces import NOT_REPORTED, Array
 
 _MOST_NOTES = 200
-# Events that plots mark; contacts have a colour, and a change of frame clears the plots.
+# Events that are marked in plots; contacts have a colour, and a change of the frame clears the plots.
 _MARKS = ("tare", "tare-undone", "stages", "gap", "mark")
-# Values below this number of sigmas may be noise, which has no direction and no line of action.
+# Values below this number of sigmas may be noise, so no direction or line of action is shown.
 _SIGNIFICANT = 4.0
-# If a command's output is blocked for longer than this, s, the command is not reading the stream.
+# If nothing was read from the stream for longer than this, s, the command's output is probably blocked.
 _HELD_S = 2.0
 CONTACT, FREE, NOISE_UNKNOWN, WAITING = "contact", "free", "noise not known yet", "waiting for the first sample"
 """Results of `state`."""
-# Smallest full scale in sigmas, so that the plot of a still tool shows noise as noise.
+# Smallest full scale, in sigmas, so that noise looks small in the plot of a still tool.
 _LEAST_FULL_SIGMA = 10.0
 # Test values and limits above this are not shown: such a limit comes from an unusable noise estimate.
 _MOST_CHI2 = 1e5
 _FRAMES = (WrenchFrame(), WrenchFrame("flange", "flange"), WrenchFrame("base", "tcp"), WrenchFrame("tcp", "tcp"))
-# Delay estimates whose sigma exceeds this, s, are shown as not measured.
+# A delay estimate whose sigma exceeds this, s, is shown as not measured.
 _MEASURED_S = 0.03
 
 
@@ -57,13 +57,13 @@ class ShownWrench:
     raw_in_frame: Array
     """(6,) the raw wrench in `frame`."""
     sigma: Array
-    """(6,) sigma of `wrench`: noise, calibration and sensor under this contact; NaN until the noise is known."""
+    """(6,) sigma of `wrench` due to noise, calibration and sensor under this contact; NaN until the noise is known."""
     rest_sigma: Array
     """(6,) sigma of the mean for a free tool."""
     sample_sigma: Array
     """(6,) sigma of one sample for a free tool."""
     chi2: float
-    """Squared distance of the newest sample from a free tool."""
+    """Squared Mahalanobis distance of the newest sample from the wrench of a free tool."""
     in_contact: bool
     R_base_flange: Array
     p_base_flange_m: Array
@@ -74,7 +74,7 @@ class ShownWrench:
     stages: Stages
 
     def size(self, first: int) -> tuple[float, float]:
-        """Return the norm of the force (`first` 0) or the torque (3), and sigma along its direction."""
+        """Return the norm of the force (`first` 0) or the torque (3), and the sigma along its direction."""
         part, sigma = self.wrench[first : first + 3], self.sigma[first : first + 3]
         size = float(np.linalg.norm(part))
         return size, float(np.linalg.norm(part * sigma)) / size if size else float(sigma.max())
@@ -113,12 +113,12 @@ class View:
     """The device without new samples, and what to do; empty while samples arrive."""
     peaks: Peaks
     contact_s: float
-    """Duration of the present contact, s."""
+    """Duration of the current contact, s."""
     notes: Sequence[FeedNote]
     """Notes, newest first."""
     checks: Sequence[Check]
     columns: Callable[[int], PlotColumns]
-    """Function that returns the recent past in a number of columns."""
+    """Function that returns the recent past, divided into the given number of columns."""
     recording_s: float | None
     """Duration of the recording, s; None if none is running."""
     is_frozen: bool = False
@@ -130,12 +130,12 @@ class View:
 
     @property
     def live(self) -> ShownWrench | None:
-        """The newest mean; None while a device is silent, because an old value must not look current."""
+        """The newest mean; None while a device sends no samples, because an old value must not look current."""
         return None if self.silent else self.reading
 
     @property
     def used_range(self) -> tuple[float, str] | None:
-        """Largest used share of the sensor's range and its axis; None without a known range or a sample."""
+        """Largest used share of the sensor's range, and its axis; None without a known range or without samples."""
         fact = self.info.sensor.facts.get("range")
         if fact is None or not isinstance(fact.value, tuple) or self.reading is None:
             return None
@@ -148,7 +148,7 @@ class View:
         return float(shares[worst]), AXES[worst]
 
     def in_line(self, *, timed: bool) -> str:
-        """Return the wrench, raw without a calibration, and its axes as a line; `timed` adds time and contact."""
+        """Return a line with the wrench (raw without a calibration) and its axes; `timed` adds time and contact."""
         reading, is_raw = self.reading, self.info.is_raw
         assert reading is not None  # noqa: S101 - there is one from the first sample on
         wrench = reading.raw_in_frame if is_raw else reading.wrench
@@ -158,7 +158,7 @@ class View:
         return f"{reading.t_host_ns * 1e-9:.1f} s   {line}{contact}" if timed else line
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the state as JSON; without a wrench while a device is silent."""
+        """Return the state as JSON; the wrenches are null while a device sends no samples."""
         status, calibration, verification = self.status, self.info.result, self.info.verification
         reading, is_raw = self.reading, self.info.is_raw
         assert reading is not None  # noqa: S101 - there is one from the first sample on
@@ -193,9 +193,9 @@ class View:
 
 
 class StreamSummary:
-    """Summarises the data of a `Feed`, with `checks` to show.
+    """Summarises the data from a `Feed`, and the `checks` to show.
 
-    The noise at rest is compared with that in `dataset`, the poses of the calibration.
+    The noise at rest is compared with that in `dataset`, which has the poses of the calibration.
     """
 
     def __init__(self, feed: Feed, checks: Sequence[Check] = (), dataset: CalibrationDataset | None = None) -> None:
@@ -205,7 +205,7 @@ class StreamSummary:
         self._new_blocks, self._new_notes = feed.subscribe()
         self._found, self._checks = deque(checks), list[Check]()
         self._histories = {span_s: History(span_s) for span_s in SPANS_S}
-        # Samples of the newest mean.
+        # The samples in the newest mean.
         self._recent: Block | None = None
         self._peaks = Peaks()
         self._contact_since_ns = 0
@@ -220,7 +220,7 @@ class StreamSummary:
         self._peaks = Peaks()
 
     def view(self) -> View:
-        """Take new blocks and notes, and return the state to show."""
+        """Take the new blocks and notes, and return the state to show."""
         feed = self._feed
         while self._found:
             self._checks.append(check := self._found.popleft())
@@ -254,7 +254,7 @@ class StreamSummary:
         )
 
     def views(self, *, raises: bool = False) -> Iterator[View]:
-        """Read, and yield a view per `MEAN_S` once the noise is known; raise a failure at once, or after a time-out."""
+        """Read; once the noise is known, yield a view per `MEAN_S`. Raise failures at once, or after a time-out."""
         feed, stream = self._feed, self._feed.stream
         begin_ns: int | None = None
         is_known = False
@@ -275,7 +275,7 @@ class StreamSummary:
                     yield view
 
     def lines(self, *, once: bool, as_json: bool) -> Iterator[str]:
-        """Yield each of the `views` as a line or JSON object; with `once` only the first."""
+        """Yield each of the `views` as a line or a JSON object; with `once`, only the first."""
         for view in islice(self.views(raises=once), 1 if once else None):
             yield json.dumps(view.to_dict()) if as_json else view.in_line(timed=not once)
 
@@ -330,7 +330,7 @@ class StreamSummary:
                 for history in self._histories.values():
                     history.clear()
         rows = Block.concatenate([before, block]) if before is not None and goes_on else block
-        # After a jump back in a recording, earlier samples have later times.
+        # After a jump back in a recording, samples read earlier have later times.
         since_ns = t_ns[-1] - round(MEAN_S * 1e9)
         self._recent = rows.rows((since_ns < rows.t_host_ns) & (rows.t_host_ns <= t_ns[-1]))
         self._peaks.add(block.wrench)
@@ -342,7 +342,7 @@ class StreamSummary:
 
 
 def state(view: View) -> tuple[str, str]:
-    """Return the state of a stream with samples, and its contact test."""
+    """Return the contact state of a stream, and a text about its contact test."""
     if (reading := view.reading) is None:
         return WAITING, ""
     if np.isnan(reading.chi2) or view.status.contact_limit > _MOST_CHI2:
@@ -352,7 +352,7 @@ def state(view: View) -> tuple[str, str]:
 
 
 def wrench_meaning(view: View) -> str:
-    """Return what the wrench contains after the stages; empty before the first sample."""
+    """Return what the wrench still contains after the stages; empty before the first sample."""
     if view.reading is None:
         return ""
     stages = view.reading.stages
@@ -381,7 +381,7 @@ def _point_name(frame: WrenchFrame) -> str:
 
 
 def direction_text(reading: ShownWrench, first: int) -> str:
-    """Return the direction of the force (`first` 0) or the axis of the torque (3); empty for noise."""
+    """Return the direction of the force (`first` 0) or the axis of the torque (3); empty if it may be noise."""
     if not reading.is_significant(first):
         return ""
     axes, vector = str(reading.frame).partition(", ")[0], reading.wrench[first : first + 3]
@@ -390,7 +390,7 @@ def direction_text(reading: ShownWrench, first: int) -> str:
 
 
 def line_of_force(reading: ShownWrench | None) -> str:
-    """Return where the line of action of the contact force passes the reference point; empty for noise."""
+    """Return where the contact force's line of action passes the reference point; empty if it may be noise."""
     if reading is None or not reading.in_contact or not reading.is_significant(0):
         return ""
     force, torque = reading.wrench[:3], reading.wrench[3:]
@@ -407,12 +407,12 @@ def _utc(info: StreamInfo, t_host_ns: int) -> datetime:
 
 
 def time_of_day(info: StreamInfo, t_host_ns: int) -> str:
-    """Return a time of the stream as local time of day."""
+    """Return a time in the stream as the local time of day."""
     return _utc(info, t_host_ns).astimezone().strftime("%H:%M:%S")
 
 
 def calibration_in_words(view: View) -> list[tuple[str, str]]:
-    """Return id, verdict, age and last verification of the calibration, each with "good", "warning", "bad" or ""."""
+    """Return the calibration's id, verdict, age and last verification, each with "good", "warning", "bad" or ""."""
     calibration, found = view.info.result, view.info.verification
     if calibration is None:
         return [("sensor alone: no arm, no calibration", "warning")]
@@ -428,7 +428,7 @@ def calibration_in_words(view: View) -> list[tuple[str, str]]:
 
 
 def bias_in_words(view: View) -> list[str]:
-    """Return the tare, and the drift or the tracked bias and part."""
+    """Return texts about the tare, and about the drift or the tracked bias and part."""
     status, words = view.status, list[str]()
     if status.tare is not None and status.tare_t_host_ns is not None:
         force_N = float(np.linalg.norm(status.tare[:3]))
@@ -444,12 +444,12 @@ def bias_in_words(view: View) -> list[str]:
 
 
 def link_in_words(view: View, link: LinkStatus) -> tuple[str, str, str, str]:
-    """Return rate, losses and age of a device's samples, and for the arm the delay of the wrench."""
+    """Return rate, losses and age of a device's samples, and for the arm also the delay of the wrench."""
     nominal = "" if np.isnan(link.nominal_rate_Hz) else f" of {link.nominal_rate_Hz:.0f}"
     age = f"{1e3 * link.age_s:.0f} ms" if link.age_s < 1 else f"{link.age_s:.1f} s"
     sigma_s, delay = view.status.delay_sigma_s, f"delay {1e3 * view.status.delay_s:.1f}"
     delay += f" ± {1e3 * sigma_s:.1f} ms" if sigma_s else " ms, set"
-    if link is view.status.sensor or view.replay is not None:  # a recording is aligned already
+    if link is view.status.sensor or view.replay is not None:  # a recording is already aligned
         delay = ""
     elif sigma_s >= _MEASURED_S:
         delay = "delay not measured yet"
@@ -457,7 +457,7 @@ def link_in_words(view: View, link: LinkStatus) -> tuple[str, str, str, str]:
 
 
 def other_wrenches(view: View) -> list[tuple[str, Array | None]]:
-    """Return the wrench with fewer stages and in other frames; None where a frame needs a missing setting."""
+    """Return the wrench after fewer stages and in other frames; None where a frame needs a missing setting."""
     if (reading := view.reading) is None or view.info.is_raw:
         return []
     calibration, raw, R, now = view.info.calibration, reading.raw, reading.R_base_flange, reading.frame
@@ -475,7 +475,7 @@ def other_wrenches(view: View) -> list[tuple[str, Array | None]]:
 
 
 def full_scale(columns: PlotColumns, reading: ShownWrench | None, first: int) -> float:
-    """Return a round full scale for three components that fits the recent extremes and keeps noise small."""
+    """Return a round full scale for three components that covers the recent extremes and keeps the noise small."""
     rows = slice(first, first + 3)
     largest = np.abs([columns.low[rows], columns.high[rows]])
     sigma = np.zeros(3) if reading is None else np.nan_to_num(reading.sample_sigma[rows])
@@ -488,18 +488,18 @@ def full_scale(columns: PlotColumns, reading: ShownWrench | None, first: int) ->
 # -- the screen and page of a scale
 
 NO_MASS = "- - -"
-# If the smallest mass exceeds this, kg, drift since the calibration is the cause, and a zero helps.
+# If the smallest detectable mass exceeds this, kg, the drift since the calibration is the cause, and zeroing helps.
 _UNZEROED_KG = 0.1
 
 
 def worth_of(weight: Weight) -> str:
-    """Return the sigma and the smallest mass of a weight as text."""
+    """Return a text with the sigma and the smallest detectable mass of a weight."""
     sigma_g, least_g = (to_place_of(1e3 * kg, 1e3 * kg) for kg in (weight.mass_sigma_kg, weight.least_kg))
     return f"sigma {sigma_g} g, smallest mass {least_g} g"
 
 
 def zero_in_words(weighing: Weighing) -> tuple[str, bool]:
-    """Return the age of the zero, and whether another zero would help; empty if the bias is tracked."""
+    """Return the age of the zero, and whether zeroing again would help; empty if the bias is tracked."""
     if weighing.moving:
         return "", False
     zeroed_s, weight = weighing.stream.processor.monitor.reference()[1], weighing.shown.measured

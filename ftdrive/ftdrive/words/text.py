@@ -1,4 +1,4 @@
-"""Texts that are safe on any terminal, and commands in the form to type."""
+"""Texts that are safe on any terminal, and commands as they must be typed."""
 
 import os
 import re
@@ -39,7 +39,7 @@ COMMANDS: Final[Mapping[str, str]] = {
 """Help line of each command, by the name of its module in `ftdrive.commands`."""
 _COMMAND = re.compile(rf"(?<![\w./-])(?<!uv run )ftdrive (?=(?:{'|'.join(COMMANDS)}|help)\b|--)")
 GLUE: Final = "\ue000"
-"""A space at which lines of help or tables are not broken; a private-use character, so no message contains it."""
+"""A space at which lines are not broken in help or tables; a private-use character, so no message contains it."""
 
 
 def as_typed(text: str) -> str:
@@ -50,7 +50,7 @@ def as_typed(text: str) -> str:
 
 
 def is_command(line: str) -> bool:
-    """Whether a line is a command only; such a line is never broken, so that it can be copied."""
+    """Whether a line is only a command; such a line is never broken, so that it can be copied."""
     return line.startswith(("ftdrive ", "uv run ftdrive "))
 
 
@@ -89,7 +89,7 @@ class TextLine:
     """A line of text with its style."""
 
     head: str
-    """A mark or indent; a wrapped line continues below the first word after it."""
+    """A mark or an indent; wrapped lines continue below the first word after it."""
     words: str
     style: str = ""
     """Style for rich, on a terminal with colour."""

@@ -1,4 +1,4 @@
-"""`ftdrive export calibration`: write a calibration with signs, units, order and frames of another program."""
+"""`ftdrive export calibration`: write a calibration with the signs, units, order and frames of another program."""
 
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext

@@ -40,7 +40,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     """
     if page_path is not None:
         require_extra("fleet", "--html", "jinja2")
-    gc.freeze()  # otherwise, garbage collection of the imports takes a tenth of the time
+    gc.freeze()  # otherwise, garbage collection of the imports would take a tenth of the time
     found, now = open_store(url), datetime.now(UTC)
     observed = Observed.read(found, now)
     fleet = fleet_of(observed, found)
@@ -71,7 +71,7 @@ def _status_row(one: CellState, now: datetime) -> tuple[str, ...]:
     return (one.cell, one.tool_in_words, one.verdict or "none", age, verified, drift, due, weighed)
 
 
-# The ports from 9100 to 9999 are all assigned to Prometheus exporters.
+# All ports from 9100 to 9999 are assigned to Prometheus exporters.
 PORT = 10018
 MONITORING = Path(__file__).parents[2] / "fleet" / "monitoring"
 
