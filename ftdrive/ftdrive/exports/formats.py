@@ -1,6 +1,6 @@
 """The formats of an exported calibration as data: keys, units, signs and frames of each target.
 
-Without numpy, because help and completion must be fast. `registry.py` computes the named values, and writes a row.
+Without numpy, because help and completion must be fast. `registry.py` computes the named values and fills them in.
 """
 
 from collections.abc import Mapping
@@ -96,7 +96,7 @@ _OWN_READING: Final[tuple[Property, ...]] = ("tilt", "rotation", "response")
 FORMATS: Mapping[str, ExportFormat] = {
     # kth-ros-pkg/force_torque_tools, gravity_compensation/src/gravity_compensation_node.cpp and
     # gravity_compensation.cpp, master since pull request 18 (2021-05). a is the acceleration that its IMU reports,
-    # turned into the sensor frame, which points up at rest:
+    # in the axes of the sensor; at rest, it points up:
     #     force = raw - bias[:3] + gripper_mass a        torque = raw - bias[3:] + gripper_com x (gripper_mass a)
     "kth": ExportFormat(
         "ROS 1 node gravity_compensation of kth-ros-pkg/force_torque_tools",
@@ -217,9 +217,9 @@ FORMATS: Mapping[str, ExportFormat] = {
         ),
     ),
     # jrl-umi3218/mc_rtc, src/mc_rbdyn/ForceSensor.cpp, master; Robot.cpp gives it the gravity of constants.h. 13
-    # numbers, one a line: mass, rpy, com, offset. `rpy` turns the sensor of the model into the real one, here that of a
-    # model whose sensor has the axes of the flange. `com` is in the axes of the sensor's parent body, from its origin:
-    # here the flange. The offset has the torque first. g is along -z of the world, p is the sensor's position:
+    # numbers, one per line: mass, rpy, com, offset. `rpy` turns the sensor of the model into the real one, here that of
+    # a model whose sensor has the axes of the flange. `com` is in the axes of the sensor's parent body, from its
+    # origin: here the flange. The offset has the torque first. g is along -z of the world, p is the sensor's position:
     #     force = raw - offset[3:] - mass g
     #     torque = raw - offset[:3] - (com - p) x (mass g), in sensor axes
     # White space must follow the last number. The reader stops there.
@@ -259,8 +259,8 @@ FORMATS: Mapping[str, ExportFormat] = {
     ),
     # frankarobotics/libfranka, include/franka/robot.h, 0.8 or newer: mass (kg), centre of mass in flange axes from the
     # flange (m), inertia about the centre of mass (kg m2, column by column), as the service SetLoad of franka_ros takes
-    # them. The load is all that the flange carries. Neither formula nor g of the firmware are public; g is along -z of
-    # the base, which cannot be changed:
+    # them. The load is all that the flange carries. Neither the formula nor g of the firmware is public; g is along -z
+    # of the base, which cannot be changed:
     #     force on the flange = mass g                   torque about the flange = F_x_Cload x (mass g)
     "franka": ExportFormat(
         "Franka libfranka setLoad, with the mass of the sensor",
@@ -339,11 +339,11 @@ iyy="{J[4]!r}" iyz="{J[5]!r}" izz="{J[8]!r}" />
         ),
         elsewhere={"gravity of the simulation": "$gravity_m_s2"},
     ),
-    # MuJoCo, whose element `attach` puts the body into the flange, and ros-controls/mujoco_ros2_control, which looks
+    # MuJoCo, whose element `attach` attaches the body to the flange, and ros-controls/mujoco_ros2_control, which looks
     # for the sensors NAME_force and NAME_torque. The plugin is fts_grav_comp_plugin.cpp of mujoco_ros2_control_plugins,
-    # pull request 308 of September 2026, newer than release 0.1.2 and wrong without the weight in the model. Without it
-    # the simulated sensor shows the weight, as a real one does. With the gravity g of the model in the axes of the
-    # sensor's site, the tool at rest reads
+    # pull request 308 of September 2026, newer than release 0.1.2 and wrong without the weight in the model. Without
+    # the plugin, the simulated sensor shows the weight, as a real one does. With the gravity g of the model in the axes
+    # of the sensor's site, the tool at rest reads
     #     force = mass g                                 torque = pos x (mass g)
     # and the plugin gives, with the reading as the hardware interface has it, which is minus that of MuJoCo:
     #     force = reading - CoG.mass g                   torque = reading - CoG.pos x (CoG.mass g)

@@ -241,7 +241,7 @@ def estimated_bias(
     size = max(1, round(_READING_S * info.sensor_rate_Hz))
     readings, orientations = [np.empty((0, 6))], [np.empty((0, 3, 3))]
     waiting: list[Paired] = []
-    # the next pass over the recording ends there too
+    # the next pass over the recording ends at the same damage
     with suppress(BadRecording):
         for samples, _, share in read_ahead(source.blocks()):
             show(f"Estimating the bias: {share:.0%}")

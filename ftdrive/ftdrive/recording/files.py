@@ -123,13 +123,13 @@ class RecordingReader:
 def load_recording(path: str | Path, columns: Collection[str] = ROW.names or ()) -> Recording:
     """Read a whole recording into memory, with `RecordingReader`.
 
-    Raises for a damaged or empty file. A truncated file is read to its end; `cut` then gives the reason.
+    Raises `BadRecording` for a damaged or empty file. A truncated file is read to its end; `cut` then gives the reason.
     """
     # Damage raises an error, because a caller in Python would not see a printed message.
     reader = RecordingReader(Path(path), columns)
     pieces = list(reader.pieces())
     events = [event for piece in pieces for event in piece.events]
-    reduce(next_header, events, reader.header)  # a stage of a newer version raises here
+    reduce(next_header, events, reader.header)  # a stage from a newer version raises an error here
     return Recording(reader.header, np.concatenate([piece.rows for piece in pieces]), events, reader.cut)
 
 

@@ -57,7 +57,7 @@ _REGULAR = 0.2
 
 
 def is_recording(path: Path) -> bool:
-    """Whether `ftdrive record` wrote a file, from its suffix, the first line of CSV or the writer of MCAP."""
+    """Whether `ftdrive record` wrote a file, judged by its suffix, the first line (CSV) or the writer (MCAP)."""
     ending = Path(path.name.removesuffix(".partial")).suffix
     if ending != ".csv":
         return ending in ENDINGS and not is_bag(path)
@@ -139,7 +139,7 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
         raise ConfigError(missing_extra(path.name, "rosbags", "ros2")) from None
     if path.suffix == ".bag":
         with open_file(path) as file:
-            if file.read(len(_BAG)) != _BAG:  # rosbags would read a whole line
+            if file.read(len(_BAG)) != _BAG:  # rosbags would read a whole line, however long
                 raise BadDataset(f"{path.name}: the first bytes are not those of a ROS 1 bag: record it again")
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

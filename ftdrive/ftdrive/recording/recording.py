@@ -280,7 +280,7 @@ class Recording(Displayed):
         return self.rows.view(flat_layout(self.rows.dtype))
 
     def to_frame(self) -> Any:
-        """Return the samples as a DataFrame of pandas, or of Polars if pandas is missing.
+        """Return the samples as a pandas DataFrame, or as a Polars DataFrame if pandas is missing.
 
         Returns
         -------

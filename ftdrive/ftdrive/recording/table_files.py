@@ -258,7 +258,7 @@ def _text_crc(texts: Mapping[bytes, bytes]) -> str:
 
 
 def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None, str]:
-    """Read a recording in pieces; return "", because a truncated Parquet file is unreadable. Raises like `read_csv`."""
+    """Read a recording in pieces; return "", as a truncated Parquet file is unreadable. Errors as for `read_csv`."""
     from pyarrow import ArrowException, parquet
 
     with open_file(path) as raw:

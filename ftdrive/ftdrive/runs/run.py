@@ -357,7 +357,7 @@ def _require_kinds(header: Mapping[str, Any]) -> None:
 
 
 class _Whole(dict[str, Any]):
-    """A JSON object of run.json; a missing key raises `BadDataset`, which names the file."""
+    """A JSON object in run.json; a missing key raises `BadDataset`, which names the file."""
 
     def __init__(self, path: Path, content: Mapping[str, Any]) -> None:
         super().__init__(

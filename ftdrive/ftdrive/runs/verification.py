@@ -37,7 +37,7 @@ Limits = tuple[float | None, float | None]
 NO_LIMITS: Final = None, None
 # False-alarm rate: share of the verifications of an unchanged cell that fail.
 FALSE_ALARMS: Final = 0.01
-# Number of fields of a verification that a recording stores, from the first one.
+# Number of leading fields of a verification that a recording stores.
 _RECORDED: Final = 8
 # Parts of a calibration's provenance that an update keeps.
 _COPIED: Final = ("devices", "station", "setup", "edited")

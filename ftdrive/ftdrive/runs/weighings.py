@@ -49,7 +49,7 @@ def append_weighings(folder: Path, origin: Mapping[str, JSON], day: str, lines: 
         end = file.seek(0, os.SEEK_END)
         file.seek(max(0, end - _TAIL))
         tail = file.read()
-        # Remove a last line that a power failure has cut off.
+        # Remove a last line that a power failure cut short.
         begin = end - len(tail) + tail.rfind(b"\n") + 1
         file.truncate(begin)
         append_lines(file, begin, [*([] if begin else [{"format": FORMAT, "day": day, **origin}]), *lines])

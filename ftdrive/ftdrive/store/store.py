@@ -31,7 +31,7 @@ class Indexed:
     results: int
     verifications: int
     weighings: int
-    """Number of files of weighings, one per day."""
+    """Number of weighing files, one per day."""
     unreadable: tuple[str, ...]
     """Descriptions of the files that could not be read."""
 
@@ -64,8 +64,8 @@ class Store:
     def index(self, *folders: Path) -> Indexed:
         """Add the new files in these run folders, or in the run folders that they contain; return how many were added.
 
-        A file with a known path is not read again, because files of a run are never overwritten; a file of weighings
-        is read again if it has grown.
+        A file with a known path is not read again, because files of a run are never overwritten; a weighing file is
+        read again if it has grown.
         """
         paths = record_paths(folders)
         with self._current.reading() as connection:

@@ -278,7 +278,7 @@ class Table:
             yield SignalRows(t_s, wrench, place)
 
     def poses(self) -> Iterator[SignalRows]:
-        """Yield R_base_flange, row-major, and p_base_flange_m if known: (n, 9 or 12). Raises like `wrenches`."""
+        """Yield R_base_flange, row-major, and p_base_flange_m if known: (n, 9 or 12). Errors as for `wrenches`."""
         signals = [self._require("orientation"), *([one] if (one := self._found["position"]) else [])]
         if self.gravity_is_measured:
             raise BadDataset(f"{self.name}: gravity does not determine the rotation about it: give the orientation too")
@@ -349,7 +349,7 @@ class Table:
         )
 
     def _form(self, form: str) -> dict[str, JSON]:
-        """Return the form of the orientations, from which follows what mistakes in them are possible."""
+        """Return the form of the orientations, which determines what mistakes in them are possible."""
         if form in _AXES and (self.options.euler or form in _MAKERS):
             euler = self.options.euler or form
             return {"form": "euler", "euler": _MAKERS.get(euler.lower(), euler)}

@@ -183,7 +183,7 @@ class Canvas(ABC):
 
 
 def _send(fd: int, rest: bytes) -> bytes:
-    """Send the bytes that the terminal accepts until the next drawing is due; return the rest, to let keys be read."""
+    """Send the bytes that the terminal accepts until the next drawing is due; return the rest, so keys can be read."""
     due_s = time.monotonic() + REFRESH_S
     while rest and (left_s := due_s - time.monotonic()) > 0 and select.select([], [fd], [], left_s)[1]:
         rest = rest[os.write(fd, rest[:_CHUNK]) :]

@@ -100,7 +100,7 @@ def qr_code(address: str) -> list[str]:
 
 
 def indented(head: str | Text, words: str, console: Console = messages) -> Text:
-    """Return the words after a head; on a narrow terminal the next lines are indented to the first word.
+    """Return the head and the words; if lines must be broken, later ones are indented to the first word.
 
     Print the text with `soft_wrap`, so that a line with a command stays whole.
     """

@@ -118,7 +118,7 @@ def characters(dots: Dots) -> NDArray[np.str_]:
 def plot(
     low: Array, high: Array, rows: int, full: float, in_contact: NDArray[np.bool_], under: Dots | None = None
 ) -> list[Line]:
-    """Return an `envelope` as lines of n / 2 characters, above the dots `under`; contacts have their own colour."""
+    """Return an `envelope`, drawn over the dots `under`, as lines of n / 2 characters; contacts are coloured."""
     ink = characters(envelope(low, high, rows, full))
     drawn, cells = ink != " ", ink if under is None else np.where(ink != " ", ink, characters(under))
     styles = np.where(drawn, np.where(in_contact, CONTACT, TRACE), FAINT)

@@ -399,7 +399,7 @@ def keys(view: View, width: int) -> Line:
 
 
 def show_table(views: Iterable[View]) -> None:
-    """Show each view as a table, without keys and events, until the views end or the operator stops."""
+    """Show each view as a table, without keys and events, until the views end or the operator interrupts."""
     shown = Group()
     with (
         # an echoed Enter would break the screen

@@ -138,7 +138,7 @@ class PlainOperator(_Keyless):
         self._write_lines(self._text.lines(event))
 
     def ask(self, question: Question) -> str:
-        """Return the answer from stdin, ignoring earlier input of a terminal. Raises `Declined` at the end of stdin."""
+        """Return the answer from stdin, ignoring keys typed earlier in a terminal. Raises `Declined` at its end."""
         self.supervisor.expect_answer()
         self._asked = question.text
         self.finish()

@@ -210,7 +210,7 @@ def _keys(view: SessionView) -> list[Text]:
     # keys are only read between the first and the last pose
     useful: set[Key] = set()
     if view.now is not None and view.now.stop is not None:
-        # in hand guiding, the number of poses is open
+        # in hand guiding, the number of poses is not fixed
         useful = set(KEYS) if view.now.stops is None else set(KEYS) - {Key.KEEP}
     line = Text()
     for key, word in KEYS.items():

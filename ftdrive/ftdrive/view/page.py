@@ -39,7 +39,7 @@ class Page:
     def put(self, parts: Mapping[str, Part | None]) -> None:
         """Show parts by name, all at once; None removes a part. Unchanged parts are not sent again.
 
-        The name up to the first slash is that of a place in `page.html`, such as `state`, or `scene`.
+        The name up to the first slash is that of a place in `page.html`, such as `state` or `scene`.
         """
         texts = {name: json.dumps(part, allow_nan=False, separators=(",", ":")) for name, part in parts.items()}
         with self._lock:
@@ -113,7 +113,7 @@ def drawing(page: Page, draw: Callable[[], None], say: Callable[[str], object] =
     def run() -> None:
         due_s = monotonic()
         try:
-            # drawings missed while the computer was busy are not made up for
+            # drawings missed while the computer was paused are not made up for
             while not ended.wait(max(0.0, due_s - monotonic())):
                 due_s = max(due_s + _PERIOD_S, monotonic())
                 draw()

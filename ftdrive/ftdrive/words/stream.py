@@ -123,7 +123,7 @@ class View:
     """Duration of the recording, s; None if none is running."""
     is_frozen: bool = False
     can_push: bool = False
-    """Whether a key can push the tool, because it is emulated."""
+    """Whether a key can push the tool, which only an emulated cell allows."""
     replay: RecordingSource | None = None
     calibrated: Array | None = None
     """(n, 3) unit vectors of gravity in flange axes at the calibrated orientations; None if unknown."""
