@@ -160,7 +160,7 @@ def calibrate_command(
         page = stack.enter_context(view.page("ftdrive calibrate"))
         header = {} if options.resume is None else Run(options.resume).header_to_resume()
         made_by = header.get("station")
-        # A resumed run keeps its emulated or real cell.
+        # A resumed run keeps its cell, emulated or real.
         simulate = simulate or bool(made_by and not (described.config or described.robot or tool))
         if simulate:
             # A hanging load needs real time to stop swinging.

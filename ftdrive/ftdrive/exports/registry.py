@@ -281,7 +281,7 @@ class Exported:
     elsewhere: Mapping[str, JSON]
     """Values that the target reads from another place, by their names in that place."""
     max_force_error_N: float
-    """Largest difference from `CalibrationResult.compensate` of a free tool over all orientations, N."""
+    """Largest difference from `CalibrationResult.compensate` for a free tool, over all orientations, N."""
     max_torque_error_Nm: float
 
 

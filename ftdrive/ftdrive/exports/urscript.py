@@ -157,7 +157,7 @@ def _cylinder(part: dict[str, Any]) -> str:
 
 def _require_exportable(plan: Plan) -> None:
     """Raise `PlanRefused` for sweeps, placeholders, moves not proven clear, and values that no arm can reach."""
-    # The exported text has no room for a verdict, so plans that are not proven clear are not exported.
+    # The exported text contains no verdict, so plans that are not proven clear are not exported.
     if plan.sweep is not None:
         raise PlanRefused("this plan is a sweep, which no other program can follow: export the plan of a tour")
     if not plan.measured:
