@@ -48,25 +48,28 @@ def sentence(row: str, count: int, ceiling: int) -> str:
 def counts_of(sources: dict[str, str]) -> dict[str, int]:
     """Count what the product has, except for lines of tests."""
     trees = [parsed(source) for source in sources.values()]
-    nodes = [node for tree in trees for node in ast.walk(tree)]
+    nodes = [[*ast.walk(tree)] for tree in trees]
     public = [node for tree in trees for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
-    inside = {
-        id(child)
-        for node in nodes
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        for child in ast.walk(node)
-        if isinstance(child, ast.Import | ast.ImportFrom)
-    }
+    inside = 0
+    for of_file in nodes:
+        bodies = {
+            line
+            for node in of_file
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+            for line in range(node.body[0].lineno, (node.end_lineno or 0) + 1)
+        }
+        inside += sum(isinstance(node, ast.Import | ast.ImportFrom) and node.lineno in bodies for node in of_file)
     return {
         "product lines": sum(len(source.splitlines()) for source in sources.values()),
         "files": len(sources),
         "dataclasses": sum(
             any("dataclass" in ast.unparse(by) for by in node.decorator_list)
-            for node in nodes
+            for of_file in nodes
+            for node in of_file
             if isinstance(node, ast.ClassDef)
         ),
         "public functions and classes": sum(not node.name.startswith("_") for node in public),
-        "import statements inside functions": len(inside),
+        "import statements inside functions": inside,
     }
 
 
