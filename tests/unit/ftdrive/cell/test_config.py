@@ -8,7 +8,6 @@ import pytest
 from ftdrive.cell.config import (
     NOMINAL_ORIENTATION_DEG,
     RULES,
-    CellConfig,
     as_toml,
     load,
     orientation_accuracy_deg,
@@ -35,28 +34,6 @@ def write_user_file(text: str) -> None:
     (user_folder("config") / "ftdrive.toml").write_text(text)
 
 
-def test_every_section_reaches_the_cell(tmp_path: Path) -> None:
-    path = tmp_path / "cell.toml"
-    path.write_text(
-        GOOD
-        + "height_mm = 33\nmass_kg = 0.255\n"
-        + '[tool]\nname = "gripper"\ncylinders_mm = [[0, 33, 80], [33, 200, 100, 0, -5.5]]\nmass_kg = 1.2\n'
-        + '[workcell]\nmounting = "30"\nplanes_mm = [[-1, 0, 0, -800]]\nboxes_mm = [[10, 20, 30, 40, 50, 60]]\n'
-        + "measured = true\n"
-    )
-    found = load(path)
-    assert (found.sensor.height_mm, found.sensor.mass_kg, found.tool.name, found.tool.mass_kg) == (
-        33,
-        0.255,
-        "gripper",
-        1.2,
-    )
-    assert found.tool.cylinders_mm == ((0.0, 33.0, 80.0), (33.0, 200.0, 100.0, 0.0, -5.5))
-    assert found.workcell.planes_mm == ((-1.0, 0.0, 0.0, -800.0),)
-    assert found.workcell.boxes_mm == ((10.0, 20.0, 30.0, 40.0, 50.0, 60.0),)
-    assert (found.workcell.mounting, found.workcell.measured) == ("30", True)
-
-
 SOURCES = ("option", "variable", "project", "user")
 
 
@@ -80,15 +57,6 @@ def test_the_first_that_says_it_counts(said: tuple[str, ...], monkeypatch: pytes
     assert (found["robot.host"].value, found["robot.host"].origin) == (hosts[said[0]], origins[said[0]])
     assert found["robot.model"].origin == (origins["user"] if "user" in said else "not set")
     assert found["robot.speed_deg_s"].origin == "default"
-
-
-def test_a_named_file_replaces_the_projects_but_not_the_users(tmp_path: Path) -> None:
-    write_user_file(HEAD + "[site]\ng_m_s2 = 9.81\n")
-    Path("ftdrive.toml").write_text(HEAD + "[sampling]\naverage_s = 9\n")
-    path = tmp_path / "cell.toml"
-    path.write_text(GOOD)
-    found = load(path)
-    assert (found.site.g_m_s2, found.sampling.average_s) == (9.81, 2.0)
 
 
 @pytest.mark.parametrize(
@@ -136,15 +104,6 @@ def test_a_variable_that_cannot_be_used_is_named(
     with pytest.raises(ConfigError) as error:
         settings()
     assert all(word in str(error.value) for word in words), error.value
-
-
-@pytest.mark.parametrize(
-    ("said", "record_s"),
-    [("", 12), ("average_s = 1\n", 0), ("noise_record_s = 30\n", 30), ("average_s = 1\nnoise_record_s = 30\n", 30)],
-)
-def test_an_average_that_is_said_alone_needs_no_record(said: str, record_s: float) -> None:
-    Path("ftdrive.toml").write_text(f"{GOOD}[sampling]\n{said}")
-    assert load().sampling.noise_record_s == record_s
 
 
 @pytest.mark.parametrize(
@@ -196,12 +155,6 @@ def test_errors_name_file_and_key(text: str, word: str, tmp_path: Path) -> None:
     assert str(path) in str(error.value) or "is not set" in str(error.value)
 
 
-def test_a_mark_of_the_byte_order_is_no_text(tmp_path: Path) -> None:
-    path = tmp_path / "cell.toml"
-    path.write_text(GOOD, encoding="utf-8-sig")  # as an editor on Windows may write it
-    assert load(path).robot.host == "10.0.0.2"
-
-
 def test_the_readme_describes_every_key() -> None:
     def row(key: str, rule: Rule) -> str:
         default = settings()[key]
@@ -221,18 +174,6 @@ def test_what_was_meant_is_suggested(text: str, meant: str) -> None:
     Path("ftdrive.toml").write_text(f"{HEAD}{text}\n")
     with pytest.raises(ConfigError, match=rf"did you mean {meant}\? the (keys|sections) are "):
         load()
-
-
-def test_a_plan_needs_no_addresses() -> None:
-    assert isinstance(load(devices=False), CellConfig)
-    with pytest.raises(ConfigError, match="ftdrive init"):
-        load()
-
-
-def test_a_relative_folder_of_the_user_does_not_count(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("XDG_CONFIG_HOME", "relative")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert user_folder("config") / "ftdrive.toml" == tmp_path / ".config" / "ftdrive" / "ftdrive.toml"
 
 
 def test_a_password_of_the_store_reaches_no_file() -> None:

@@ -62,27 +62,6 @@ def test_the_end_of_an_inner_block_does_not_end_the_outer_one(cell: CellClock, c
         assert cell.now_ns() == seen + LEAD_NS
 
 
-def test_the_cell_does_not_wait_for_a_thread_that_is_away(cell: CellClock, clock: EmulatedClock) -> None:
-    with clock.keeping_up():
-        with clock.away():
-            seen = cell.now_ns()
-            time.sleep(0.05)
-            assert cell.now_ns() > seen + LEAD_NS
-        seen = clock.now_ns()
-        time.sleep(0.05)
-        assert cell.now_ns() == seen + LEAD_NS
-
-
-def test_the_time_of_the_cell_is_held_for_a_thread_that_asks_for_it(cell: CellClock, clock: EmulatedClock) -> None:
-    with clock.keeping_up():
-        seen = clock.now_ns()
-        with clock.held():
-            time.sleep(0.05)
-            assert [cell.now_ns(), clock.now_ns(), cell.now_ns()] == [seen + LEAD_NS] * 3
-        clock.now_ns()
-        assert cell.now_ns() > seen + LEAD_NS
-
-
 def test_the_time_of_a_played_device_waits_for_the_threads_of_its_process() -> None:
     clock, passed = LocalClock(), threading.Event()
 
@@ -103,34 +82,6 @@ def test_the_time_of_a_played_device_waits_for_the_threads_of_its_process() -> N
         clock.sleep(0.01)
     assert passed.wait(5.0)
     other.join()
-
-
-def test_two_threads_have_two_slots(cell: CellClock, clock: EmulatedClock) -> None:
-    begun, end = threading.Event(), threading.Event()
-
-    def sit() -> None:
-        with clock.keeping_up():
-            begun.set()
-            end.wait()
-
-    other = threading.Thread(target=sit)
-    with clock.keeping_up():
-        other.start()
-        begun.wait()
-        seen = clock.now_ns()
-        time.sleep(0.05)
-        clock.now_ns()
-        assert cell.now_ns() <= seen + LEAD_NS
-    end.set()
-    other.join()
-
-
-@pytest.mark.usefixtures("running")
-def test_a_sleeper_is_not_waited_for_until_it_wants_to_wake(clock: EmulatedClock) -> None:
-    with clock.keeping_up():
-        begin = clock.now_ns()
-        clock.sleep(0.05)
-        assert clock.now_ns() >= begin + 50_000_000
 
 
 @pytest.mark.usefixtures("running")

@@ -22,12 +22,6 @@ def test_masses(text: str, kg: float) -> None:
     assert parse_quantity("--tool-mass", text, KG) == kg
 
 
-@pytest.mark.parametrize("text", ["", "high", "nan", "1.2 kg", "1 2", "1.200,5", "33 furlong"])
-def test_what_is_no_length(text: str) -> None:
-    with pytest.raises(ConfigError, match=r"--height is .* not a number"):
-        parse_quantity("--height", text, MM)
-
-
 @pytest.mark.parametrize(("units", "text"), [(MM, "1,200"), (KG, "-1,200 g"), (DEG_S, "12,000")])
 def test_a_comma_that_may_separate_thousands_is_not_guessed(units: dict[str, str], text: str) -> None:
     with pytest.raises(ConfigError, match="ambiguous"):

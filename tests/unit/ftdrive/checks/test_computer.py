@@ -151,19 +151,6 @@ def test_can_interface_that_is_down_missing_or_something_else(can0: Path) -> Non
     assert checks.can_interfaces(can0 / "nothing") == []
 
 
-def test_can_details_are_taken_from_what_ip_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ip = tmp_path / "ip"
-    said = (
-        '[{"ifname":"can0","linkinfo":{"info_kind":"can","info_data":'
-        '{"state":"ERROR-ACTIVE","bittiming":{"bitrate":500000}}}}]'
-    )
-    ip.write_text(f"#!/bin/sh\n[ \"$5\" = can0 ] && echo '{said}'\n")
-    ip.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    assert checks.can_details("can0") == {"kind": "can", "state": "ERROR-ACTIVE", "bitrate": 500_000}
-    assert checks.can_details("can1") == {}
-
-
 @pytest.mark.parametrize(
     ("url", "place", "port", "interface"),
     [
@@ -201,16 +188,6 @@ def test_what_an_address_says(url: str, place: str | None, port: str | None, int
 def test_what_is_no_address_is_a_mistake_of_the_user() -> None:
     with pytest.raises(BadUrl, match=r"write it like ati-can://can0"):
         SensorAddress.of("ati-can://[can0")
-
-
-def test_disk_that_can_be_written_and_one_that_cannot(tmp_path: Path) -> None:
-    fine = checks.check_disk(tmp_path / "not/yet/there")
-    assert fine.state in {"ok", "warning"}
-    assert str(tmp_path) in fine.found
-    (tmp_path / "file").touch()
-    bad = checks.check_disk(tmp_path / "file" / "runs")
-    assert bad.state == "failed"
-    assert "--runs" in str(bad.fix)
 
 
 @pytest.mark.parametrize(("free", "state"), [(1e8, "failed"), (5e8, "warning"), (5e9, "ok")])

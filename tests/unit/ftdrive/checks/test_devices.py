@@ -23,9 +23,7 @@ from ftdrivers.errors import (
     DeviceError,
     DeviceFault,
     DeviceTimeout,
-    Frozen,
     NoDashboard,
-    PortInUse,
     ProtocolError,
     StreamBroken,
 )
@@ -400,24 +398,6 @@ def not_opened(found: str, cure: str = "") -> ConnectError:
 
 
 @pytest.mark.parametrize(
-    "error",
-    [
-        ConnectError("serial number A, not B", "check its option serial"),
-        wrapped(ProtocolError("slot 3 is empty", "choose another")),
-        DeviceFault("status 0x0008 (bit 3: raw)", "?sinc=512 configures it"),
-        StreamBroken("silent for 0.4 s", "check cable; try again"),
-        ProtocolError("no reply (closed (x; y); z)", "check wiring"),
-        Frozen("frozen, 50 samples", "power it off and on"),
-        ConnectError("no RTDE (x; y)", "ask; look"),
-    ],
-)
-@pytest.mark.parametrize("address", [PORT, BY_NETWORK, BY_PCAN])
-def test_the_cure_that_a_message_names_is_the_one_shown(error: DeviceError, address: SensorAddress) -> None:
-    check = of_sensor.check_sensor_error("sensor.stream", error, address, [ALLOWED])
-    assert check == Check("sensor.stream", "failed", error.found, error.fix)
-
-
-@pytest.mark.parametrize(
     ("address", "ask"), [(PORT, "run ftdrive devices --probe"), (BY_NETWORK, "run ping ")], ids=["serial", "network"]
 )
 def test_to_the_cure_of_a_silence_belongs_how_to_see_who_answers(address: SensorAddress, ask: str) -> None:
@@ -453,12 +433,6 @@ def test_another_cure_is_shown_where_the_way_to_a_sensor_is_wrong_or_its_message
     found = of_sensor.check_sensor_error("sensor.stream", error, address, [permission])
     assert (found.name, found.state, found.found) == ("sensor.stream", "failed", error.found)
     assert cure in str(found.fix)
-
-
-def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -> None:
-    error = PortInUse("the port is in use", "end it, `fuser -v /dev/ttyUSB7` names it")
-    found = of_sensor.check_sensor_error("sensor.identity", error, PORT, [FORBIDDEN])
-    assert (found.found, found.fix) == (error.found, error.fix)
 
 
 @pytest.mark.parametrize(("own", "shown"), [("check the robot", "check the robot"), ("", "run ping ur5")])

@@ -39,12 +39,6 @@ def test_sensor_and_tool_add_up() -> None:
     assert load.p_flange_com_m == pytest.approx([0.0, 0.016, 0.076])
 
 
-def test_the_height_of_a_heavy_sensor_is_not_exact() -> None:
-    load = flange_load(calibrated(), 1.0, 0.06)
-    assert load.sigma_kg == pytest.approx(0.0, abs=1e-9)
-    assert load.sigma_m == pytest.approx([0.0, 0.0, 0.5 * 0.06 / np.sqrt(12)], abs=1e-9)
-
-
 def test_sigma_agrees_with_numerical_derivatives() -> None:
     rng = np.random.default_rng(4)
     root = rng.normal(size=(15, 15)) * 1e-3

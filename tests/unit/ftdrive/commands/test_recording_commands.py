@@ -25,7 +25,7 @@ from ftdrive.recording.growing_file import GrowingFile
 from ftdrive.stream.samples import Block, Stages, StreamEvent
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
-from tests.unit.ftdrive.recorded import UTC_OFFSET_NS, block, calibration, info
+from tests.unit.ftdrive.recorded import block, calibration, info
 
 END = KeyboardInterrupt()
 
@@ -86,25 +86,6 @@ def run_record(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.C
 
 def blocks(n: int, size: int = 100) -> list[Block]:
     return [block(size, start) for start in range(0, n * size, size)]
-
-
-def test_count_ends_exactly_and_files_are_equal(run_record: Run) -> None:
-    stream = FakeStream(blocks(30))
-    options = ["--count", "1234", "--stages", "lowpass_Hz=20,bias=false"]
-    code, answer, err = run_record(stream, "-o", "a.mcap", "-o", "a.csv", *options)
-    assert (code, stream.stages) == (0, Stages(bias=False, lowpass_Hz=20.0))
-    assert answer is not None
-    assert (answer["files"], answer["samples"], answer["gaps"], answer["lost"]) == (["a.mcap", "a.csv"], 1234, 0, 0)
-    assert (answer["axes"], answer["about"]) == ("sensor", "sensor")
-    assert answer["calibration"] == stream.info.calibration_name
-    assert "the serial number is unknown" in err
-    one, other = (load_recording(Path(name)) for name in answer["files"])
-    assert one.rows.tobytes() == other.rows.tobytes()
-    assert len(one.rows) == 1234
-    assert one.header.configuration["robot"]["host"] == "10.0.0.2"
-    (delay,) = one.events
-    assert delay.values == {"value": 0.0031, "sigma": 0.0002}
-    assert one.header.info.utc_offset_ns == UTC_OFFSET_NS
 
 
 SILENT = DeviceTimeout("sensor silent for 0.3 s", "check its cable")

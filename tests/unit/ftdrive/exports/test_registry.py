@@ -24,13 +24,6 @@ def test_a_tilt_that_would_change_the_force_is_an_error(name: str) -> None:
     assert export_calibration(tilted(0.2), name, MEASURED).max_force_error_N == pytest.approx(0.0685, abs=1e-4)
 
 
-def test_no_model_is_proposed_in_place_of_a_target_that_reads_the_sensor() -> None:
-    with pytest.raises(NotAccepted, match="Choose another format") as error:
-        export_calibration(tilted(1.8), "admittance", MEASURED)
-    assert "ros2-control" in str(error.value)
-    assert not [name for name in ("urdf", "mujoco", "ur-payload") if name in str(error.value)]
-
-
 def test_a_rejected_calibration_is_not_exported() -> None:
     with pytest.raises(NotAccepted, match="a very different mounting"):
         export_calibration(rejected(), "json", MEASURED)
@@ -61,12 +54,6 @@ def test_the_centre_of_the_sensor_is_half_way_up_unless_given(name: str) -> None
     given = export_calibration(calibration(), name, replace(MEASURED, sensor_com_mm=half_way))
     assert numbers_in(assumed.text) == pytest.approx(numbers_in(given.text))
     assert any("--sensor-com" in note for note in assumed.notes)
-
-
-@pytest.mark.parametrize("name", [name for name, one in FORMATS.items() if one.file.endswith("yaml")])
-def test_what_needs_no_place_takes_none(name: str) -> None:
-    if name not in ("franka", "mc-rtc"):
-        export_calibration(calibration(R_flange_sensor=np.eye(3)), name, Settings())
 
 
 @pytest.mark.parametrize("frame", ["", "a b", "a\nb: 1", "-x", "a--b", "a-", '"', "a#", "ö"])

@@ -204,15 +204,6 @@ def test_a_sensor_known_by_loads_is_decoded_or_its_largest_error_is_named(name: 
         assert 100 * error.max() == pytest.approx(float(stated[1]), rel=0.06)
 
 
-def test_models_have_the_mass_without_the_error_of_a_sensor_known_by_loads() -> None:
-    rng = np.random.default_rng(5)
-    sensor = replace(SensorMatrix.usual(), source="loads", error=0.03 * np.eye(6))
-    calibration = replace(arbitrary(rng, ()), sensor=sensor)
-    mass = re.search(r'mass value="([^"]*)"', export_calibration(calibration, "urdf", settings_of(rng)).text)
-    assert mass
-    assert float(mass[1]) == pytest.approx(calibration.mass_kg / 1.03)
-
-
 @pytest.mark.parametrize("name", [name for name, one in FORMATS.items() if "bias" not in one.subtracts])
 def test_a_target_without_bias_says_so(name: str) -> None:
     rng = np.random.default_rng(0)

@@ -76,19 +76,6 @@ def export(path: Path, *arguments: str) -> Result:
     return CliRunner().invoke(cli, ["export", "plan", str(path), *arguments])
 
 
-def test_a_plan_of_an_emulated_cell_says_so_before_it_moves(plan: Plan, tmp_path: Path) -> None:
-    emulated = plan.marked(measured=True, emulated=True)
-    assert emulated.why[0] == "The cell is EMULATED: no real arm may follow this plan."
-    emulated.save(tmp_path / "plan.json")
-    assert Plan.load(tmp_path / "plan.json").emulated
-    pendant = Pendant(list(plan.steps[0].q_rad))
-    pendant.run(urscript.program(emulated, dwell_s=1.0))
-    assert any(words.startswith("EMULATED CELL: no real arm may follow this plan.") for words in pendant.said)
-    assert "EMULATED" in urscript.plan_table(emulated).splitlines()[0]
-    assert not plan.emulated
-    assert "EMULATED" not in urscript.program(plan, dwell_s=1.0)
-
-
 def test_the_program_visits_what_was_planned_as_it_was_planned(plan: Plan) -> None:
     first = list(plan.steps[0].q_rad)
     pendant = Pendant([angle + radians(29) for angle in first])
@@ -253,17 +240,6 @@ def test_a_file_of_another_kind_and_an_edited_plan_are_refused(path: Path, tmp_p
     assert refused is not None
     assert exit_code(refused) == 7
     assert "changed" in str(refused)
-
-
-@pytest.mark.parametrize(("first", "doubles"), [(24, 22), (26, 22), (27, 15), (33, 15)])
-def test_every_name_has_its_register(first: int, doubles: int) -> None:
-    text = functions(first, example=True)
-    assert "<" not in text.replace("<=", "").replace(" < ", "")
-    assert f"read_input_integer_register({first + 4})" in text
-    assert ("def ftd_bias" in text) == (doubles == 22), "the tracked bias has no room behind a later register"
-    assert f"read_input_float_register({first + doubles - 1})" in text
-    assert f"read_input_float_register({first + doubles})" not in text
-    assert "read_input_integer_register(23)" not in text
 
 
 def test_the_command_prints_or_saves(tmp_path: Path) -> None:

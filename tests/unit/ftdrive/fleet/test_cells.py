@@ -29,21 +29,6 @@ def written(folder: Path, text: str, head: str = 'format = "ftdrive.cells/1"\n')
     return path
 
 
-def test_a_cell_has_what_its_configuration_says(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (
-        '[cells.press-4]\nconfig = "a/ftdrive.toml"\nverify_every_days = 7\n'
-        '[cells.lab]\nconfig = "b.toml"\nverify_every_days = 0.5\narm_serial = "222"\n'
-    )
-    path = written(folder, text)
-    (folder / "elsewhere").mkdir()
-    monkeypatch.chdir(folder / "elsewhere")  # paths are relative to the file
-    press, lab = read_cells(path)
-    assert (press.name, press.config) == ("press-4", str(folder / "a/ftdrive.toml"))
-    assert (press.arm_serial, press.robot_host, press.tool) == ("111", "10.0.0.1", "drill")
-    assert (press.verify_every_days, press.sensor_url) == (7.0, None)
-    assert (lab.arm_serial, lab.verify_every_days, lab.sensor_url) == ("222", 0.5, "ati-can://can0")
-
-
 def test_a_variable_that_would_be_the_same_in_all_cells_is_refused(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,11 +32,6 @@ def payload(
     return result(name, 1, step=noisy(ord(name)) if step is None else step, payload_kg=kg, payload_com_m=com, **more)
 
 
-def test_right_payloads_are_no_finding() -> None:
-    assert found("abc", [payload("a"), payload("b"), payload("c", off_axis_m=None)]) == []
-    assert found("abc", [result(name, 1, step=noisy(ord(name))) for name in "abc"]) == []
-
-
 def test_a_centre_of_mass_that_is_wrong_in_several_controllers_is_named() -> None:
     wrong = np.zeros(2)
     (one,) = found("abcd", [payload("a"), *(payload(name, off_axis_m=wrong) for name in "bcd")])

@@ -13,7 +13,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.fleet.metrics import NAMES, MetricsServer
+from ftdrive.fleet.metrics import MetricsServer
 from ftdrive.fleet.state import FleetFinding
 from tests.unit.ftdrive.fleet.fleet_records import weighed
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated, reading
@@ -114,19 +114,6 @@ def test_a_cell_that_disappears_disappears(server: MetricsServer) -> None:
     assert {name for _, name in samples(server)} == {"", "A", "B"}
     server.update(*reading(cell("B")))
     assert {name for _, name in samples(server)} == {"", "B"}
-
-
-def test_tools_of_a_cell_are_distinguished_and_any_name_is_escaped(server: MetricsServer) -> None:
-    name = 'Zelle "7"\\ü\n'
-    server.update(*reading(cell(name, "gripper"), cell(name, "drill", mass_kg=2.0, emulated=True)))
-    families = {one.name: one for one in text_string_to_metric_families(scraped(server))}
-    marks = {tuple(one.labels[key] for key in ("tool", "emulated")) for one in families["ftdrive_cell_info"].samples}
-    assert marks == {("gripper", "false"), ("drill", "true")}
-    masses = {tuple(one.labels.values()): one.value for one in families["ftdrive_tool_mass_kilograms"].samples}
-    assert masses == {(name, "gripper"): 1.25, (name, "drill"): 2.0}
-    assert families.keys() == {one.removesuffix("_total") for one in NAMES}, (
-        "the parser leaves the end of a counter out"
-    )
 
 
 def test_labels_have_no_control_characters(server: MetricsServer) -> None:

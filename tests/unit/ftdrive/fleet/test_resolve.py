@@ -2,15 +2,13 @@
 
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import ANY
 
-import numpy as np
 import pytest
 
-from ftcalib import CalibrationResult, Finding
+from ftcalib import CalibrationResult
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.resolve import Comparison, is_calibration, solve_again, solve_run, solved_path
 from ftdrive.fleet.workers import Workers
@@ -29,16 +27,6 @@ def at_once(function: Callable[..., bytes], *arguments: Any) -> "Future[bytes]":
 
 def again(*folders: Path, submit: Any = at_once) -> dict[Path, Comparison | str]:
     return dict(solve_again(folders, Workers(1, submit, BrokenExecutor)))
-
-
-WORN = Finding.of("few_poses", n_poses=5, recommended=6)
-
-
-def rewrite(path: Path, **changes: Any) -> None:
-    """Change the calibration of a run."""
-    result = replace(CalibrationResult.load(path), **changes)
-    path.unlink()
-    result.save(path)
 
 
 def test_the_result_is_that_of_the_run_and_replaces_nothing(tmp_path: Path) -> None:
@@ -79,20 +67,6 @@ def test_a_run_that_has_the_result_is_not_solved_again(tmp_path: Path) -> None:
     assert solved_path(folder).stat() == first
 
 
-def test_changes_are_named_with_their_sigmas(tmp_path: Path) -> None:
-    folder = calibrated_run(tmp_path, "run")
-    path = folder / "calibration.json"
-    own = CalibrationResult.load(path)
-    sigma = np.sqrt(own.covariance[7, 7])
-    rewrite(path, parameters=own.parameters.moved(-8 * sigma * np.eye(15)[7]), findings=(WORN,))
-    found = again(folder)[folder]
-    assert isinstance(found, Comparison)
-    assert (found.parameter, found.verdict_before, found.verdict) == ("force_bias_N.y", "usable", "good")
-    assert found.sigmas == pytest.approx(8 / np.sqrt(2))  # the sigmas of both
-    assert found.has_changed
-    assert found.has_other_verdict
-
-
 def test_a_run_without_a_result_of_its_newest_poses_has_another_verdict(tmp_path: Path) -> None:
     folder = calibrated_run(tmp_path, "run")
     dataset(2).save(folder / "dataset-2.json")  # more poses were taken, and the solve of all was rejected
@@ -117,15 +91,6 @@ def test_a_failure_has_its_reason_and_concerns_one_run(tmp_path: Path) -> None:
     assert "no run.json" in str(found[lost])
     assert isinstance(found[fine], Comparison)
     assert [one.name for one in tmp_path.glob("*/solved-*")] == [solved_path(fine).name]
-
-
-def test_an_unexpected_error_is_named(tmp_path: Path) -> None:
-    folder = calibrated_run(tmp_path, "run")
-
-    def submit(*_: Any) -> "Future[bytes]":
-        return at_once(lambda: bytes(1 // 0))
-
-    assert again(folder, submit=submit) == {folder: "unexpected ZeroDivisionError: integer division or modulo by zero"}
 
 
 def test_a_worker_of_another_version_ends_it(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from ftdrive.errors import ConfigError
 from ftdrive.fleet import workers
 from ftdrive.fleet.workers import (
     SAME,
-    Answer,
     Call,
     WorkerDied,
     Workers,
@@ -27,24 +26,6 @@ ITEMS = [Path(f"run-{number}") for number in range(40)]
 
 def name_of(item: Path) -> bytes:
     return item.name.encode()
-
-
-def test_few_calls_are_in_memory_at_a_time() -> None:
-    made = received = most = 0
-
-    def counted(item: Path) -> Call:
-        nonlocal made, most
-        made += 1
-        most = max(most, made - received)
-        return name_of, item
-
-    found = dict[Path, Answer]()
-    with ThreadPoolExecutor(2) as threads:
-        for item, answer in answers(counted, ITEMS, Workers(2, threads.submit, BrokenExecutor)):
-            received += 1
-            found[item] = answer
-    assert found == {item: name_of(item) for item in ITEMS}
-    assert most == 4
 
 
 def test_a_lost_call_is_repeated_and_one_that_kills_two_workers_is_given_up() -> None:

@@ -71,18 +71,6 @@ def test_the_plan_is_proven_with_its_load() -> None:
     assert certifier().without_load.arm.hung is None
 
 
-def test_no_proven_move_brings_anything_nearer_than_its_clearance() -> None:
-    found = certifier()
-    rng = np.random.default_rng(1)
-    start = USUAL_POSTURE_RAD + rng.uniform(-1.2, 1.2, (300, 6))
-    end = start + rng.uniform(-0.5, 0.5, (300, 6))
-    certificate = found.certify(start, end, tight=False)
-    clear = np.flatnonzero(certificate.clear)
-    assert 5 < len(clear) < 300
-    for share in np.linspace(0, 1, 21):
-        assert found.free(start[clear] + share * (end - start)[clear]).all()
-
-
 @pytest.mark.slow
 def test_a_load_has_no_room_under_a_low_ceiling() -> None:
     low = CellConfig(CELL.robot, CELL.sensor, CELL.tool, WorkcellConfig(planes_mm=((0, 0, -1, -450),)))

@@ -1,6 +1,5 @@
 """The choice of a plan, its file, its speeds, and when it is refused."""
 
-import itertools
 import json
 from dataclasses import replace
 from functools import cache
@@ -15,10 +14,9 @@ from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.scene import Box, Plane, Scene
-from ftdrive.planning.motion import Speeds, move_duration_s, tips
+from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan, digest, fingerprints
 from ftdrive.planning.planner import TOOL_POSES, USUAL_POSTURE_RAD, guess_of, plan_for, plan_tour
-from ftdrive.planning.search.tours import shortest_tour
 from ftdrivers.sweep import Sweep
 from ftdrivers.ur.kinematics import MODELS as NOMINAL
 from ftdrivers.ur.kinematics import Array, Kinematics
@@ -32,7 +30,6 @@ TOOLS = (
     (Cylinder(0, 0.05, 0.08), Cylinder(0.05, 0.2, 0.15)),
 )
 CELL = CellConfig(RobotConfig("arm"), SensorConfig("fake://"))
-NO_TIP_LIMIT = Speeds(tip_m_s=None)
 
 
 def certifier_of(
@@ -54,21 +51,6 @@ def usual(poses: int = 24) -> Plan:
     return planned(certifier_of(), poses=poses)
 
 
-@pytest.mark.parametrize("model", ["UR3e", "UR10e"])
-def test_figures_of_the_constant_tour(model: str) -> None:
-    plan = planned(certifier_of(model), speeds=NO_TIP_LIMIT)
-    document = plan.to_dict()
-    assert (document["kind"], document["poses"], document["uncertified_segments"]) == ("constant", 24, 0)
-    assert document["certified"]
-    assert document["max_move_deg"] <= 90.1
-    assert document["motion_time_s"] == pytest.approx(54.0)  # 24 moves of 90 degrees at 60 degrees/s and 80 degrees/s2
-    assert document["min_clearance_mm"] > 20
-    slower = [planned(certifier_of(model, tool)).to_dict() for tool in TOOLS]
-    assert {one["kind"] for one in slower} == {"constant"}
-    assert max(one["motion_time_s"] for one in slower) <= 62
-
-
-@pytest.mark.slow
 def test_poses_of_a_new_tool_spread_gravity_like_a_tetrahedron(monkeypatch: pytest.MonkeyPatch) -> None:
     certifier = certifier_of()
     plan = plan_for(CELL, certifier, USUAL_POSTURE_RAD, TOOL_POSES)
@@ -199,29 +181,6 @@ def test_a_forged_plan_that_collides_is_refused() -> None:
     forged = replace(plan, steps=tuple(replace(step, q_rad=one) for step, one in zip(plan.steps, q, strict=True)))
     with pytest.raises(PlanRefused, match="cannot be proven clear"):
         forged.require(certifier_of())
-
-
-def test_shortest_tour_is_the_best_of_all() -> None:
-    rng = np.random.default_rng(5)
-    q = rng.uniform(-2, 2, (15, 6))
-    group = np.repeat(np.arange(5), 3)
-    allowed = np.asarray(rng.random((15, 15)) < 0.9)
-    allowed &= allowed.T & (group[:, None] != group)
-    turn = np.abs(q[:, None] - q)
-    cost = move_duration_s(turn.max(axis=2), NO_TIP_LIMIT.joint_rad_s, NO_TIP_LIMIT.joint_rad_s2)
-    cost = np.where(allowed, cost + 0.02 * turn.sum(axis=2), 1e6)
-    best = min(
-        sum(cost[3 * a + i, 3 * b + j] for (a, i), (b, j) in itertools.pairwise([*closed, closed[0]]))
-        for order in itertools.permutations(range(1, 5))
-        for picks in itertools.product(range(3), repeat=5)
-        for closed in [list(zip((0, *order), picks, strict=True))]
-    )
-    tour = shortest_tour(cost, group, allowed)
-    assert tour is not None
-    assert sorted(group[tour]) == [0, 1, 2, 3, 4]
-    assert cost[tour, np.roll(tour, -1)].sum() == pytest.approx(best)
-    allowed[group == 2] = allowed[:, group == 2] = False
-    assert shortest_tour(cost, group, allowed) is None
 
 
 def test_posture_that_cannot_be_is_refused() -> None:

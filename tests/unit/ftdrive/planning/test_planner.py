@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from syrupy.assertion import SnapshotAssertion
 
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.cell.rules import Rows
@@ -22,24 +21,6 @@ SHOULDER = 1
 def cell(planes: Sequence[Row] = (), boxes: Sequence[Row] = (), tool: Rows = ((0, 60, 90),)) -> CellConfig:
     workcell = WorkcellConfig(planes_mm=tuple(map(tuple, planes)), boxes_mm=tuple(map(tuple, boxes)))
     return CellConfig(RobotConfig(""), SensorConfig("", height_mm=33), ToolConfig(cylinders_mm=tool), workcell)
-
-
-@pytest.mark.parametrize(
-    ("plane", "named"),
-    [
-        ((1, 0, 0, 800), ["base", "[-1, 0, 0, -800]", "[1, 0, 0, -800]"]),  # both ways to fix it
-        ((0, 0, -1, -100), ["shoulder", " 0 mm"]),  # a ceiling at its height
-        ((-1, 0, 0, -100), [" 12 mm", " 30 mm"]),
-    ],
-    ids=str,
-)
-def test_a_plane_with_the_arm_itself_on_its_wrong_side_is_named(
-    plane: Row, named: Sequence[str], snapshot: SnapshotAssertion
-) -> None:
-    with pytest.raises(ConfigError) as error:
-        certifier_for(cell(planes=[(0, 0, 1, -5), plane]), "ur5e")
-    assert [value for value in (str(list(plane)), *named) if value not in str(error.value)] == []
-    assert str(error.value) == snapshot
 
 
 @given(

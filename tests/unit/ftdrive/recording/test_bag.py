@@ -287,17 +287,6 @@ def test_a_file_that_is_no_bag_of_ros_1_is_not_read_to_the_end_of_its_line(tmp_p
         read_bag(tmp_path / "a.bag", None, None)
 
 
-def test_a_recording_of_ours_is_no_bag(tmp_path: Path) -> None:
-    from ftdrive.recording import Recorder
-    from tests.unit.ftdrive.recorded import block, info
-
-    recorder = Recorder([tmp_path / "a.mcap"], info(), {})
-    recorder.add(block(100), [])
-    recorder.end()
-    assert not is_bag(tmp_path / "a.mcap")
-    assert not is_bag(tmp_path)
-
-
 def test_a_file_of_ros_1_and_a_bag_without_stamps_are_read(tmp_path: Path) -> None:
     from rosbags.rosbag1 import Writer as Writer1
 

@@ -200,23 +200,6 @@ def test_a_file_that_another_program_has_divided_otherwise_is_read(paths: Sequen
     same(load_recording(paths[0]), load_recording(tmp_path / "other.mcap"))
 
 
-def test_the_table_is_plain_to_other_programs(paths: Sequence[Path]) -> None:
-    recording = load_recording(paths[0])
-    lines = [line for line in paths[1].read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
-    names = lines[0].split(",")
-    assert names[:7] == ["t_s", "t_utc_s", "t_host_ns", "t_device_s", "seq", "status", "raw_fx"]
-    assert "base axes, about the tcp origin" in paths[1].read_text(encoding="utf-8").partition("\n")[0]
-    table = parquet.read_table(paths[2], columns=["t_s", "fz", "q5", "in_contact"])
-    column = [float(line.split(",")[names.index("t_s")]) for line in lines[1:]]
-    np.testing.assert_array_equal(table["t_s"], column)
-    assert column[0] == 0.0
-    utc_s = [float(line.split(",")[names.index("t_utc_s")]) for line in lines[1:]]
-    np.testing.assert_allclose(utc_s, (recording.rows["t_host_ns"] + UTC_OFFSET_NS) * 1e-9, rtol=0, atol=1e-6)
-    np.testing.assert_array_equal(table["fz"], recording.rows["wrench"][:, 2])
-    np.testing.assert_array_equal(table["q5"], recording.rows["q_rad"][:, 5])
-    np.testing.assert_array_equal(table["in_contact"], recording.rows["in_contact"])
-
-
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Five seconds at 30 Hz."""
@@ -339,33 +322,6 @@ def test_parquet_that_pyarrow_has_copied_stays_a_recording_and_other_parquet_is_
     parquet.write_table(table.drop_columns(["fz"]), tmp_path / "c.parquet")
     with pytest.raises(BadRecording, match="columns are not those of a recording"):
         load_recording(tmp_path / "c.parquet")
-
-
-def test_an_mcap_file_of_another_program_without_checksums_is_read(
-    small: Sequence[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = load_recording(small[0])
-    monkeypatch.setattr("zlib.crc32", lambda _content, _before=0: 0)
-    write_recording(tmp_path / "a.mcap", whole)
-    monkeypatch.undo()
-    same(load_recording(tmp_path / "a.mcap"), whole)
-
-
-def test_events_stand_where_they_happened_also_after_a_conversion(paths: Sequence[Path], tmp_path: Path) -> None:
-    end = StreamEvent(7_602_000_000_000, "delay", "…", {"value": 0.0})
-    recording = load_recording(paths[0])
-    last = StreamEvent(int(recording.rows["t_host_ns"][-1]), "mark", "at the last sample")
-    write_recording(tmp_path / "a.csv", replace(recording, events=[*recording.events, last, end]))
-    lines = (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines()
-    found = {}
-    for number, line in enumerate(lines):
-        if line.startswith("# event "):
-            event = json.loads(line.removeprefix("# event "))
-            found[event["text"]] = [one.split(",")[2] for one in lines[number + 1 :] if not one.startswith("#")]
-    t_ns = recording.rows["t_host_ns"]
-    assert found[MARK.text] == [str(t) for t in t_ns[t_ns > MARK.t_host_ns]]
-    assert found[GAP.text] == [str(t) for t in t_ns[t_ns > GAP.t_host_ns]]
-    assert found["at the last sample"] == found["…"] == []
 
 
 def test_mcap_ros2_reads_the_messages(paths: Sequence[Path]) -> None:

@@ -222,14 +222,6 @@ def test_a_missing_package_is_named_with_its_extra(
     assert not (tmp_path / f"a{ending}.partial").exists()
 
 
-@pytest.mark.parametrize(("content", "words"), [("", "first line"), ("# ftdrive.recording/1\n", "header is missing")])
-def test_a_file_of_another_kind_is_named_with_its_fault(content: str, words: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text(content)
-    with pytest.raises(BadRecording, match=f"a.csv: .*{words}"):
-        load_recording(path)
-
-
 def test_a_newer_version_is_refused() -> None:
     document = Header(info(), BASE_TCP, USUAL).to_dict() | {"format": "ftdrive.recording/2"}
     with pytest.raises(BadRecording, match="use a newer program"):

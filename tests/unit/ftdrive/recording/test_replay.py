@@ -24,16 +24,6 @@ def replayed(seconds: float = 4.0, **options: Any) -> tuple[Stream, RecordingSou
     return Stream(source, **options).open(), source, clock
 
 
-def test_it_lasts_as_long_as_the_recording() -> None:
-    stream, _, clock = replayed(1.5)
-    begin_s, samples = clock.now_s(), list(stream)
-    assert len(samples) == 1500
-    assert clock.now_s() - begin_s == pytest.approx(1.5, abs=0.02)
-    assert stream.has_ended
-    assert len(stream.read()) == 0
-    assert samples[-1].force_sigma_N == pytest.approx(NOISE[:3], rel=0.1)
-
-
 @pytest.mark.parametrize("speed", [0.5, 8.0])
 def test_speed_scales_the_time(speed: float) -> None:
     stream, source, clock = replayed(0.8)

@@ -197,34 +197,6 @@ def dots_of(axes: Any) -> list[Array]:
     ]
 
 
-def test_the_map_of_coverage_shows_gravity_and_its_largest_gap(drawn: Draw) -> None:
-    rng = np.random.default_rng(2)
-    seen = rng.normal(size=(40, 3))
-    seen /= np.linalg.norm(seen, axis=1)[:, None]
-    for towards in ([0.6, 0.0, 0.8], [-0.96, 0.28, 0.0]):
-        facts = {"coverage": {"gravity_in_flange": seen, "gap_towards": towards, "largest_gap_rad": 0.7}}
-        (axes,) = drawn("coverage", facts).axes
-        (dots,) = dots_of(axes)
-        np.testing.assert_allclose(dots, seen, atol=1e-6)
-        circle = next(line for line in axes.lines if to_hex(line.get_color()) == SERIES[1])
-        x, y = circle.get_data()
-        drawn_at = ~np.isnan(x)
-        np.testing.assert_allclose(directions(x[drawn_at], y[drawn_at]) @ towards, np.cos(0.7), atol=1e-6)
-        steps = np.hypot(np.diff(x), np.diff(y))
-        assert np.nanmax(steps) < 0.5  # no line across the map where the circle leaves it
-        assert np.isnan(x).sum() == (2 if towards[0] < 0 else 0)
-    places = {text.get_text(): text.get_position() for text in axes.texts}
-    for name, along in (("+x", [1, 0, 0]), ("+y", [0, 1, 0]), ("-y", [0, -1, 0]), ("-x", [-1, 0, 0])):
-        x, y = places[name]
-        np.testing.assert_allclose(directions(x, y + 0.2), along, atol=1e-6)
-    assert places["+z"][1] > np.sqrt(2)
-    assert places["-z"][1] < -np.sqrt(2)
-    for line in axes.lines[:8]:
-        if line is not circle:
-            elevation, azimuth = np.degrees(np.arcsin(directions(*line.get_data())[:, 2])), line.get_xdata()
-            assert np.ptp(elevation) == pytest.approx(180) or np.ptp(azimuth) > 3
-
-
 def test_of_many_dots_every_so_many_is_drawn(drawn: Draw) -> None:
     for n, shown in ((MOST_DOTS, MOST_DOTS), (MOST_DOTS + 1, MOST_DOTS // 2 + 1)):
         seen = np.tile([0.0, 0.0, 1.0], (n, 1))

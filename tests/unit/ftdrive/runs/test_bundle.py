@@ -213,14 +213,6 @@ def test_a_file_larger_than_any_bundle_is_not_read(tmp_path: Path, monkeypatch: 
         pass
 
 
-def test_what_is_too_large_for_memory_is_left_out_and_named(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (run.folder / "notes.txt").write_bytes(b"x" * 300_000)
-    monkeypatch.setattr(bundle, "_MOST_IN_MEMORY", 200_000)
-    assert "notes.txt" in write_bundle(run.folder, tmp_path / "a.zip")[1]
-
-
 def test_shapes_larger_than_memory_are_refused_in_a_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     array = io.BytesIO()
     np.lib.format.write_array_header_1_0(array, {"descr": "<f8", "fortran_order": False, "shape": (10**30, 6)})
@@ -290,11 +282,3 @@ def test_a_bundle_of_a_damaged_run_keeps_the_damage_visible(run: Run, tmp_path: 
     write_bundle(folder, tmp_path / "a.zip")
     with unpack(tmp_path / "a.zip") as found, pytest.raises(BadDataset, match="differs from its checksum"):
         Run(found).header()
-
-
-def test_who_added_poses_last_stays_here(run: Run, tmp_path: Path) -> None:
-    folder = tmp_path / "runs" / "mine"
-    shutil.copytree(run.folder, folder)
-    with Run(folder):
-        write_bundle(folder, tmp_path / "a.zip")
-    assert not [name for name in contents(tmp_path / "a.zip") if name.endswith("lock")]

@@ -13,11 +13,6 @@ from ftdrive.runs.source import SolveOptions, circumstances_of, read_source, sol
 from tests.unit.ftdrive.fake_cell import Lab
 
 
-@pytest.mark.parametrize(("text", "mass"), [("2", (2.0, 0.002)), ("2.0±0.01", (2.0, 0.01)), ("1.5+-0.02", (1.5, 0.02))])
-def test_a_mass_has_a_sigma(text: str, mass: tuple[float, float]) -> None:
-    assert mass_of(text) == pytest.approx(mass)
-
-
 @pytest.mark.parametrize("text", ["", "two", "0", "-1", "nan", "inf", "2±0", "2±3", "2±nan", "1±2±3"])
 def test_a_mass_that_cannot_be_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="the mass"):

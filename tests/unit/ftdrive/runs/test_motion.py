@@ -3,14 +3,13 @@
 import zipfile
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from ftcalib.errors import BadDataset
 from ftcalib.motion.samples import measured_s
-from ftdrive.runs import motion, numbers
+from ftdrive.runs import numbers
 from ftdrive.runs.motion import MotionRecording, files_of, means_of
 from ftdrivers.interfaces import ArmStates, FtSamples
 
@@ -22,17 +21,6 @@ def recording(n: int = 500, rate_Hz: float = 100.0) -> MotionRecording:
     return MotionRecording(
         samples, ArmStates(t_ns, np.arange(n) / rate_Hz, zeros, zeros, eye, np.zeros((n, 3))), rate_Hz
     )
-
-
-def test_it_reads_back_what_was_saved(tmp_path: Path) -> None:
-    one = recording()
-    one.save(tmp_path / "motion.npz")
-    again = MotionRecording.load(tmp_path / "motion.npz")
-    assert np.array_equal(again.samples.wrench, one.samples.wrench)
-    assert np.array_equal(again.states.R_base_flange, one.states.R_base_flange)
-    assert again.nominal_rate_Hz == one.nominal_rate_Hz
-    wrench, poses = means_of(tmp_path / "motion.npz")
-    assert (wrench.samples, poses.samples) == (500, 500)
 
 
 def test_no_single_bit_of_its_headers_can_end_in_another_error(tmp_path: Path) -> None:
@@ -88,22 +76,6 @@ def test_parts_are_read_like_one_file_and_an_incomplete_one_is_ignored(tmp_path:
     for one, other in zip(means_of(folder), means_of(tmp_path / "motion.npz"), strict=True):
         for found, expected in zip(one.result(), other.result(), strict=True):
             np.testing.assert_allclose(found, expected, atol=1e-9)
-
-
-def test_a_part_that_is_added_while_a_recording_is_read_waits_for_the_next_look(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "motion"
-    folder.mkdir()
-    recording().save(folder / "1.npz")
-
-    def measured_meanwhile(*arguments: Any) -> Any:
-        recording().save(tmp_path / "new.npz")
-        (tmp_path / "new.npz").replace(folder / "2.npz")
-        return measured_s(*arguments)
-
-    monkeypatch.setattr(motion, "measured_s", measured_meanwhile)
-    assert means_of(folder)[0].samples == 500
 
 
 def test_samples_that_are_received_late_do_not_move_the_others() -> None:

@@ -71,25 +71,6 @@ def test_a_run_whose_payload_is_right_in_pounds_is_not_good(lab: Lab) -> None:
     assert ["lbf", "N·m"] in outcome.result.findings[0].values["units"]
 
 
-@pytest.mark.parametrize(
-    ("payload_kg", "sensor_kg", "differs"), [(1.9, 0.8, False), (1.9, None, False), (2.8, 0.8, True)]
-)
-def test_the_mass_of_the_sensor_counts(payload_kg: float, sensor_kg: float | None, differs: bool, lab: Lab) -> None:
-    lab.cell = replace(lab.cell, sensor=SensorConfig("fake://", mass_kg=sensor_kg))
-    lab.arm.set_status(payload_kg=payload_kg)
-    outcome = lab.calibrate()
-    assert outcome is not None
-    assert bool(payload_notes(lab)) is differs
-    assert [one.code for one in outcome.result.findings] == ["payload_mismatch"] * differs + ["gain_unknown"]
-
-
-def test_a_controller_that_does_not_report_its_payload_is_not_compared(lab: Lab) -> None:
-    lab.arm.set_status(payload_kg=None)
-    lab.take_poses()
-    assert lab.operator.of(Weighed) == []
-    assert payload_notes(lab) == []
-
-
 @pytest.mark.slow
 def test_a_payload_that_was_corrected_before_the_run_goes_on_is_no_longer_reported(lab: Lab) -> None:
     lab.arm.set_status(payload_kg=2.5)
@@ -116,15 +97,6 @@ def test_a_session_saves_no_result_as_good_whose_tool_is_elsewhere_unless_it_was
     assert (saved.verdict, saved.findings[0].code) == ("usable", "com_outside_tool")
     edit(lab.run().folder / "run.json", lambda header: header["config"]["workcell"].update(measured=False))
     assert solve_records(lab.run(), lab.run().records()).result.verdict == "good"
-
-
-@pytest.mark.parametrize(("mounting", "up"), [("floor", (0, 0, 1)), ("ceiling", (0, 0, -1)), (None, None)])
-def test_a_mounting_counts_as_declared_only_if_it_was_given(mounting: str | None, up: Any, lab: Lab) -> None:
-    lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting=mounting))
-    options = SessionOptions(lab.folder)
-    description = describe_run(Calibrating(lab.cell, options), options, {})
-    found = circumstances_of(Run.create(lab.folder, "r", description)).setup.up_in_base
-    assert found == (None if up is None else pytest.approx(up, abs=1e-12))
 
 
 def test_a_cell_with_a_clock_of_its_own_marks_its_results_as_emulated(lab: Lab) -> None:

@@ -5,7 +5,6 @@ import os
 import platform
 import re
 import resource
-import shlex
 import signal
 import subprocess
 import sys
@@ -79,16 +78,6 @@ def test_a_damaged_header_names_its_file_and_what_is_wrong(
         assert run.header_to_resume()["devices"]["arm"]["serial"]
 
 
-def test_a_header_that_is_no_json_names_its_file(run: Run) -> None:
-    (run.folder / "run.json").write_text('{"format": "ftd')
-    with pytest.raises(BadDataset, match=r"run\.json: .*JSON"):
-        run.header()
-
-
-def test_what_a_later_version_keeps_is_left_out(run: Run) -> None:
-    assert run.header()["config"]["tool"] == {"mass_kg": None}
-
-
 @pytest.mark.parametrize("mode", ["auto", "step"])
 def test_without_its_plan_a_run_cannot_go_on_and_says_how_to_solve_it(mode: str, run: Run) -> None:
     edit(run.folder / "run.json", lambda header: header.update(mode=mode))
@@ -115,25 +104,6 @@ def test_a_recording_that_lacks_something_is_named(run: Run) -> None:
         np.savez(kept, **data)
     with pytest.raises(BadDataset, match=r"01\.npz .*'steady'"):
         run.records()
-
-
-def test_a_foreign_file_is_no_pose(run: Run) -> None:
-    (run.folder / "poses" / "copy of 01.npz").touch()
-    assert run.stops() == [1]
-
-
-def test_what_is_to_be_typed_survives_the_shell(tmp_path: Path) -> None:
-    run = Run.create(tmp_path / "my $HOME 'runs'", "calibrate", {})
-    assert shlex.split(run.resume_command) == ["ftdrive", "calibrate", "--resume", str(run.folder)]
-    assert shlex.split(run.solve_command) == ["ftdrive", "solve", str(run.folder)]
-
-
-def test_the_temperature_is_the_mean_over_the_poses_as_they_were_last_taken(run: Run) -> None:
-    assert run.temperature_C() is None
-    for stop, temperature_C in ((1, 60.0), (2, None), (3, 24.0), (1, 22.0)):
-        run.append_event({"event": "pose-taken", "stop": stop, "temperature_C": temperature_C})
-    run.append_event({"event": "estimated", "stop": 4, "temperature_C": 99.0})
-    assert run.temperature_C() == 23.0
 
 
 @pytest.mark.parametrize("password", ["secret", "sec/ret", "sec@ret"])

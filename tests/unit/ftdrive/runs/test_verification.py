@@ -12,8 +12,6 @@ import pytest
 from ftcalib import CalibrationDataset, CalibrationResult
 from ftdrive.runs.verification import (
     FORMAT,
-    VerificationRecord,
-    age_and_check,
     fitted_dataset,
     verification_near,
 )
@@ -60,13 +58,6 @@ def test_the_newest_verification_of_this_calibration_counts(tmp_path: Path, besi
         assert (found.path, found.passed, found.change) == (str(newest), False, "bias")
 
 
-def test_a_calibration_outside_of_a_run_folder_has_its_runs_beside_it(tmp_path: Path) -> None:
-    path = saved(tmp_path / "cell")
-    assert verification_near(path, calibration().id) is None
-    verify(tmp_path / "cell/runs/b-verify", 1.0)
-    assert verification_near(path, calibration().id) is not None
-
-
 def test_damaged_and_newer_files_are_ignored(tmp_path: Path) -> None:
     path = saved(tmp_path / "runs/a-calibrate")
     for name, text in (("b", "{"), ("c", "[]"), ("d", '{"format": "ftdrive.verification/1"}')):
@@ -77,21 +68,6 @@ def test_damaged_and_newer_files_are_ignored(tmp_path: Path) -> None:
     assert verification_near(path, calibration().id) is None
     (words,) = read_records([tmp_path / "runs/f/verification.json"])[1]
     assert "f/verification.json: verification.json lacks" in words
-
-
-def test_a_record_survives_its_way_into_a_recording(tmp_path: Path) -> None:
-    record = VerificationRecord.load(verify(tmp_path / "a", 1.0, passed=False, change="payload"))
-    kept = VerificationRecord.from_dict(json.loads(json.dumps(record.to_dict())))
-    assert kept == record._replace(id="")
-
-
-def test_the_state_of_a_calibration_in_words(tmp_path: Path) -> None:
-    made = replace(calibration(), provenance={"created_utc": (NOW - timedelta(days=3)).isoformat()})
-    assert age_and_check(made, None, NOW) == "3 d old, not verified"
-    record = VerificationRecord.load(verify(tmp_path / "a", 2.0))
-    assert age_and_check(made, record, NOW) == "3 d old, verified 2 h ago"
-    failed = VerificationRecord.load(verify(tmp_path / "b", 2.0, passed=False, change="bias"))
-    assert age_and_check(made, failed, NOW) == "3 d old, VERIFICATION FAILED 2 h ago (bias)"
 
 
 def test_the_poses_of_a_calibration_are_found_by_their_hash(tmp_path: Path) -> None:

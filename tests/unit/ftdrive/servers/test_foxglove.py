@@ -54,21 +54,6 @@ def numbers(*parts: Any) -> list[float]:
     return [getattr(part, axis) for part in parts for axis in "xyz"]
 
 
-def test_the_server_is_what_viewers_expect(client: Client) -> None:
-    assert client.socket.subprotocol == "foxglove.sdk.v1"
-    assert client.info["name"] == "ftdrive: gripper, calibration.json"
-    assert {"parameters", "services"} <= set(client.info["capabilities"])
-    assert {topic: item["schemaName"] for topic, item in client.channels.items() if topic != STATUS} == {
-        ros2.RAW: "geometry_msgs/msg/WrenchStamped",
-        ros2.COMPENSATED: "geometry_msgs/msg/WrenchStamped",
-        ros2.POSE: "geometry_msgs/msg/PoseStamped",
-        ros2.JOINTS: "sensor_msgs/msg/JointState",
-        ros2.TRANSFORMS: "tf2_msgs/msg/TFMessage",
-        ARROWS: "foxglove.SceneUpdate",
-        EVENTS: "foxglove.Log",
-    }
-
-
 @pytest.mark.parametrize(("topic", "sign", "frame"), [(ros2.RAW, 1, "sensor"), (ros2.COMPENSATED, -1, "base_at_tcp")])
 def test_every_wrench_is_sent(server: FoxgloveServer, client: Client, topic: str, sign: int, frame: str) -> None:
     client.subscribe(topic)
@@ -136,18 +121,6 @@ def test_the_status_says_what_is_shown_and_is_valid_json(server: FoxgloveServer,
     assert status["status"]["drift_N_h"] is None  # NaN there
 
 
-def test_tare_is_a_service(stream: FakeStream, client: Client) -> None:
-    client.call("tare")
-    assert client.answer() == {"success": True, "message": "bias +0.4 N"}
-    assert stream.tares == 1
-    client.call("undo_tare")
-    assert client.answer()["success"]
-    assert stream.tares == 0
-    stream.contact = True
-    client.call("tare")
-    assert client.answer() == {"success": False, "message": "3.4 N from the free tool"}
-
-
 def test_parameters_are_the_frame_and_the_stages(stream: FakeStream, client: Client) -> None:
     stages = {name: 0.0 if value is None else value for name, value in asdict(Stages()).items()}
     at_first = {"axes": "sensor", "about": "sensor", **stages}
@@ -162,23 +135,6 @@ def test_parameters_are_the_frame_and_the_stages(stream: FakeStream, client: Cli
     client.was_set()
     assert stream.frame == WrenchFrame("base", "flange")
     assert stream.stages == Stages(gravity=False, deadband_N=0.5)
-
-
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ({"axes": "base", "gravity": 1}, "gravity cannot be 1: set true or false"),
-        ({"bias": False, "about": "tcp"}, "the height of the sensor is not configured"),
-    ],
-)
-def test_a_wrong_parameter_changes_nothing(
-    stream: FakeStream, client: Client, values: dict[str, object], words: str
-) -> None:
-    before = client.parameters()
-    client.set(**values)
-    assert words in client.read("status")["message"]
-    assert client.was_set() == before
-    assert (stream.frame, stream.stages) == (WrenchFrame(), Stages())
 
 
 def test_a_client_that_never_reads_delays_no_other(

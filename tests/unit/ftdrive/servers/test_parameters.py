@@ -17,21 +17,6 @@ FRAME = WrenchFrame("base", "tcp")
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "wanted"),
-    [
-        ("axes", "flange", "flange"),
-        ("about", [0, 0.1, -0.2], (0.0, 0.1, -0.2)),
-        ("bias", False, False),
-        ("notch_Hz", 20, 20.0),
-        ("lowpass_Hz", 0, None),
-    ],
-)
-def test_a_value_is_taken_as_the_stages_have_it(name: str, value: Any, wanted: Any) -> None:
-    found = checked_value(name, value)
-    assert (found, type(found)) == (wanted, type(wanted))
-
-
-@pytest.mark.parametrize(
     ("name", "value", "fix"),
     [
         ("axes", "tool", "set one of sensor, flange, base, tcp"),

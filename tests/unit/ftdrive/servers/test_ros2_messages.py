@@ -35,22 +35,6 @@ def reports(
     return reports_of(cast("Any", stream), lost_before, 42)
 
 
-def test_a_healthy_stream_reports_its_state() -> None:
-    stream, sensor, arm, calibration = reports()
-    assert [(one.part, one.level) for one in (stream, sensor, arm, calibration)] == [
-        *(("stream", Level.OK), ("sensor", Level.OK), ("arm", Level.OK), ("calibration", Level.OK))
-    ]
-    assert (sensor.text, sensor.hardware) == ("998 Hz", "ATI Mini45 FT12345")
-    assert sensor.values == {"rate_Hz": "998.4", "lost": "7", "age_s": "0.001"}
-    assert (arm.text, arm.values["lost"]) == ("500 Hz", "2")
-    assert (calibration.text, calibration.values) == ("3 d old", {"file": "c.json", "verdict": "good"})
-    assert stream.text.startswith("base axes, about the tcp origin; ")
-    expected = {"axes": "base", "about": "tcp", "tool": "gripper", "calibration": "29ce87", "verdict": "good",
-                "tare": "none", "delay_s": "0.00312", "delay_sigma_s": "0.0002", "drift_N_h": "0.12",
-                "messages_sent": "42"}  # fmt: skip
-    assert stream.values == {**expected, "stages": stream.text.partition("; ")[2]}
-
-
 def test_what_is_wrong_has_its_level() -> None:
     assert reports(lost_before=4)[1].text == "3 samples lost since the last report"
     assert reports(lost_before=6)[1].level is Level.WARN

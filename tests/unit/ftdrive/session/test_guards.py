@@ -149,15 +149,6 @@ def test_every_stop_and_change_of_the_controller_is_seen_at_once(different: dict
     assert looks.trip(status=replace(STATUS, **different)).hazard == hazard
 
 
-def test_a_protective_stop_is_reported_with_the_payload_that_may_have_caused_it() -> None:
-    stopped = replace(STATUS, fault=DeviceFault("protective stop", "…"), safety_mode="protective stop")
-    assert "1.50 kg" in str(Looks(SafetyGuard()).trip(status=stopped))
-    without = str(Looks(SafetyGuard()).trip(status=replace(stopped, payload_kg=None)))
-    assert without.endswith("payload or centre of mass")
-    braked = replace(STATUS, fault=DeviceFault("emergency stop", "…"), safety_mode="robot emergency stop")
-    assert "payload" not in str(Looks(SafetyGuard()).trip(status=braked))
-
-
 @pytest.mark.parametrize(("moving", "after_s"), [(True, 0.1), (False, 0.5)])
 def test_a_silent_sensor_is_seen_in_time(moving: bool, after_s: float) -> None:
     looks = Looks(SensorGuard(LIMITS), moving=moving)

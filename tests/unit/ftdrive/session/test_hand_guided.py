@@ -1,6 +1,5 @@
 """Poses that another client moves the arm to: which are taken, what is shown, when it ends. The clock is simulated."""
 
-import re
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -283,14 +282,6 @@ def test_an_arm_that_hardly_rests_or_creeps_is_not_measured() -> None:
     np.testing.assert_allclose(outcome.kept[0].before.R_base_flange, FRONT.as_matrix(), atol=1e-9)
 
 
-def test_a_repeat_is_reported_once_and_left_out() -> None:
-    near = Rotation.from_euler("y", 9.0, degrees=True)
-    nudged = near * Rotation.from_euler("x", 0.5, degrees=True)
-    outcome = Outcome(dwells(UP, DOWN, near, nudged, LEFT))
-    assert outcome.stops == [1, 2, 3]
-    assert outcome.person.words().count("This orientation is 9° from pose 1") == 1
-
-
 def test_keep_ends_it_when_the_poses_are_enough_and_not_before() -> None:
     outcome = Outcome(dwells(*AROUND, Rotation.from_euler("x", 45, degrees=True)), keys={8.0: Key.KEEP, 32.0: Key.KEEP})
     words = outcome.person.words()
@@ -354,17 +345,6 @@ def trembling(t: Array) -> Array:
     force = np.zeros((len(t), 6))
     force[:, 1] = 2.0 * np.sin(40 * t) * (t < 3.0)
     return force
-
-
-def test_a_hand_on_the_tool_is_named_and_the_pose_taken_again() -> None:
-    outcome = Outcome([Dwell(UP), Dwell(DOWN, 9.0, wrench=trembling), Dwell(LEFT)])
-    assert outcome.stops == [1, 2, 3]
-    assert all(record.steady for record in outcome.kept)
-    words = outcome.person.words()
-    assert re.search(r"sigma of fy is 1\.\d N, but 0\.0[45]\d* in the quietest pose", words)
-    assert "Let go of" in words
-    assert [event.attempts for event in outcome.person.shown if isinstance(event, PoseTaken)] == [1, 2, 1]
-    assert np.abs(outcome.kept[1].mean.mean[1] - BIAS[1]) < 0.05  # without the hand
 
 
 def test_a_pose_that_is_never_quiet_is_kept_and_marked() -> None:

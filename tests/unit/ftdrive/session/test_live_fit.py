@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import Finding, Parameters, solve
 from ftcalib.model import predict
-from ftcalib.poses.information import T12, Guess, TOOL_DOWN_R_base_flange, special
-from ftcalib.poses.selection import cone_candidates, tilted_candidates
+from ftcalib.poses.information import TOOL_DOWN_R_base_flange, special
+from ftcalib.poses.selection import tilted_candidates
 from ftcalib.routine import PoseRecord, TourPose, dataset_from
 from ftdrive.planning.search.nodes import NUMBERS
 from ftdrive.runs.load import Load
@@ -72,25 +72,6 @@ def run(taken: list[PoseRecord], running: RunningFit | None = None) -> Estimated
     running = running or RunningFit()
     running._records = {one.stop: one for one in taken[:-1]}
     return running.add(taken[-1])
-
-
-def test_the_special_orientations_have_the_figures_of_the_theory() -> None:
-    event = run(records(special(T12)))
-    assert event.faces == (2, 2, 2, 2, 2, 2)
-    assert event.cond9 == pytest.approx(1.22, abs=0.03)
-    assert event.cond_u1 == pytest.approx(1.73, abs=0.1)
-    assert event.empty_cap_deg == pytest.approx(54.7, abs=2)  # from a cube's corner to its faces
-    assert event.light == "green"
-
-
-@pytest.mark.parametrize(("half_angle_deg", "light"), [(70, "green"), (15, "red")])
-def test_the_light_distinguishes_wide_cones_from_narrow_ones(half_angle_deg: float, light: str) -> None:
-    from ftcalib.poses.selection import choose
-
-    candidates = cone_candidates(np.radians(half_angle_deg), directions=60)
-    event = run(records(candidates[choose(candidates, 24, Guess(1.1, 0.05, 0.00125))]))
-    assert event.light == light
-    assert bool(event.hint) == (light != "green")
 
 
 def test_six_well_conditioned_poses_with_two_solutions_are_red_and_give_no_numbers() -> None:

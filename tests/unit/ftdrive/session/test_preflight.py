@@ -179,13 +179,6 @@ def test_a_program_of_another_client_is_refused_before_anything_is_done(
     assert (lab.arm.opened, lab.arm.moves, lab.operator.asked) == (1, [], [])
 
 
-def test_what_a_killed_session_left_behind_is_waited_for(lab: Lab) -> None:
-    lab.arm.program = "playing"
-    lab.clock.at(0.3, lambda: setattr(lab.arm, "program", "stopping"))
-    lab.clock.at(1.4, lambda: setattr(lab.arm, "program", "stopped"))
-    assert lab.take_poses(dry_run=True) is None
-
-
 def test_a_program_that_goes_on_is_none_that_was_left_behind(lab: Lab) -> None:
     lab.arm.program = "playing"
     lab.clock.at(1.6, lambda: setattr(lab.arm, "program", "stopped"))

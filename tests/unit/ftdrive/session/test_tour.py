@@ -17,28 +17,13 @@ from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, guess_of,
 from ftdrive.session import preflight
 from ftdrive.session.along_plan import has_completed, remember_completed
 from ftdrive.session.drive import APPROACH_RAD_S, SLOW, Progress
-from ftdrive.session.events import Asked, Checked, Key, Noted, Planned, PoseTaken, State
+from ftdrive.session.events import Asked, Checked, Key, Noted, Planned, PoseTaken
 from ftdrive.session.guards import Limits, StallGuard
 from ftdrive.session.tour import moves_s
 from ftdrive.words.session import in_words
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from tests.unit.ftdrive.fake_cell import MODEL, Lab
 from tests.unit.ftdrive.session.scenarios import Case, once, press
-
-
-def test_the_states_follow_one_another_and_all_is_written_down(lab: Lab) -> None:
-    outcome = lab.calibrate()
-    assert outcome is not None
-    assert outcome.result.mass_kg == pytest.approx(1.2, abs=0.01)
-    states = lab.operator.states()
-    one = [State.MOVE, State.SETTLE, State.SAMPLE]
-    assert states == [State.IDLE, State.PREFLIGHT, State.APPROACH, *one[1:], *one * 6, State.CLOSE, State.REPORT]
-    assert [event.stop for event in lab.operator.of(PoseTaken)] == [1, 2, 3, 4, 5, 6, 7]
-    run = lab.run()
-    lines = (run.folder / "events.ndjson").read_text().splitlines()
-    assert len(lines) == len(lab.operator.shown)
-    assert outcome.drift is not None
-    assert {path.name for path in run.folder.iterdir()} >= {"plan.json", "run.json", "dataset.json", "calibration.json"}
 
 
 def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> None:

@@ -8,7 +8,6 @@ import pytest
 
 from ftdrive.errors import BadStore
 from ftdrive.store.store import Store
-from tests.unit.ftdrive.store.run_folders import new_run, result
 
 
 def store_in(folder: Path) -> Store:
@@ -46,23 +45,9 @@ def test_a_store_opened_read_only_is_one_sentence(runs: Path, tmp_path: Path) ->
         read_only.index(runs)
 
 
-def test_a_missing_store_is_empty_and_reading_does_not_create_it(tmp_path: Path) -> None:
-    store = Store(f"sqlite:///{tmp_path / 'new' / 'store.sqlite'}")
-    assert (store.results(), store.verifications(), store.find("ab")) == ([], [], [])
-    assert not (tmp_path / "new").exists()
-    store.index(new_run(tmp_path / "runs", "a", result()))
-    assert len(store.results()) == 1
-
-
 def test_another_file_is_no_store_and_stays_as_it_is(runs: Path, tmp_path: Path) -> None:
     (tmp_path / "store.sqlite").write_text("my notes " * 1000)
     for act in (lambda: store_in(tmp_path).index(runs), store_in(tmp_path).results):
         with pytest.raises(BadStore, match="not a database"):
             act()
     assert (tmp_path / "store.sqlite").read_text() == "my notes " * 1000
-
-
-def test_a_folder_that_cannot_be_made_is_one_sentence(runs: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(BadStore, match="cannot be written"):
-        Store(f"sqlite:///{tmp_path / 'file' / 'store.sqlite'}").index(runs)

@@ -13,10 +13,8 @@ import pytest
 from sqlalchemy import text
 
 from ftdrive.errors import ConfigError
-from ftdrive.store.database import default_file
 from ftdrive.store.records import StoredCell
 from ftdrive.store.store import Store
-from tests.edited_files import edit
 from tests.postgres import Server
 from tests.unit.ftdrive.store.contents import connected, dump, wipe
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
@@ -98,17 +96,6 @@ def test_it_is_the_same_in_every_database_whatever_its_order_of_texts(
     assert dump(urls[0]) == dump(urls[1])
 
 
-def test_a_deleted_run_is_forgotten_and_a_moved_one_is_followed(runs: Path, store_url: str) -> None:
-    store = Store(store_url)
-    store.index(runs)
-    shutil.rmtree(runs / "2026-03-01-calibrate")
-    (runs / "2026-03-02-calibrate").rename(runs / "renamed")
-    store.index(runs)
-    assert [one.run for one in store.results()][:2] == ["2026-03-01-calibrate", "renamed"]
-    store.rebuild()
-    assert [one.run for one in store.results()] == ["renamed", "2026-04-01-verify", "2026-03-03-calibrate"]
-
-
 def test_runs_that_cannot_be_reached_are_kept(runs: Path, store_url: str, tmp_path: Path) -> None:
     store = Store(store_url)
     store.index(runs)
@@ -153,15 +140,6 @@ def test_an_address_that_cannot_be_used_is_named_without_its_password(
     assert "secret" not in str(error.value)
 
 
-def test_the_default_is_a_file_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    Store().index(new_run(tmp_path / "runs", "a", result()))
-    assert default_file() == tmp_path / "data" / "ftdrive" / "store.sqlite"
-    assert default_file().is_file()
-    monkeypatch.setenv("XDG_DATA_HOME", "relative")
-    assert default_file().is_relative_to(Path.home())
-
-
 def test_a_run_that_names_nothing_still_counts(store_url: str, tmp_path: Path) -> None:
     """A result solved elsewhere and put into a run: its tool comes from the run's configuration."""
     folder = new_run(tmp_path, "a")
@@ -184,29 +162,6 @@ def test_a_run_that_names_nothing_still_counts(store_url: str, tmp_path: Path) -
     assert (one.arm_model, one.robot_host, one.payload_kg, one.payload_com_m) == (None, None, None, None)
     assert one.created_utc == "2026-05-01T08:00:00.000000+00:00"
     assert (one.parent, one.update, one.temperature_C, one.dataset_sha256) == (None, None, None, None)
-
-
-def test_models_host_and_payload_come_from_the_run(store_url: str, tmp_path: Path) -> None:
-    setup = {"tool": "gripper", "payload_kg": 1.5, "p_flange_payload_m": [0.0, 0.01, 0.1 + 0.2]}
-    folder = new_run(tmp_path, "a", result(setup=setup))
-    edit(folder / "run.json", lambda header: header.update(config={"robot": {"host": "10.0.0.7"}}))
-    Store(store_url).index(folder)
-    (one,) = Store(store_url).results()
-    assert (one.arm_model, one.sensor_model, one.robot_host) == ("ARM", "SENSOR", "10.0.0.7")
-    assert (one.payload_kg, one.payload_com_m) == (1.5, [0.0, 0.01, 0.1 + 0.2])
-
-
-def test_the_change_of_the_bias_comes_back_to_the_last_digit(store_url: str, tmp_path: Path) -> None:
-    value, sigma, shared = ((np.random.default_rng(k).normal(size=6) / 3).tolist() for k in range(3))
-    whole = {"value": value, "sigma": sigma, "calibration_sigma": shared}
-    found = []
-    for day, change in enumerate((whole, None, {"value": value[:5], "sigma": [*sigma[:5], None]}, [1])):
-        verified(new_run(tmp_path, f"v{day}"), "abc", day, bias_change=change)
-    Store(store_url).index(tmp_path)
-    for one in Store(store_url).verifications():
-        found.append((one.bias_change, one.bias_change_sigma, one.calibration_sigma))
-    assert found == [(value, sigma, shared), *3 * [(None, None, None)]]
-    assert Store(store_url).fleet(1, FIRST)[2] == Store(store_url).verifications()
 
 
 def test_the_newest_are_selected_by_time_in_any_zone(store_url: str, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ftcalib.model import Array
-from ftdrive.stream.contact import ContactTest, ContactTracker, Inertia
+from ftdrive.stream.contact import ContactTest, Inertia
 from ftdrive.stream.noise import SensorNoise
 from tests.unit.ftdrive.stream.simulated import KnownNoise, calibrated, paired
 
@@ -97,27 +97,3 @@ def test_the_distance_has_all_that_is_not_known_in_its_covariance(state: int, in
     np.testing.assert_allclose(test.uncertainty, uncertainty + np.diag(BEYOND))
     restarted = judged(test, np.zeros((0, 6)), np.zeros((0, 6)), state, felt, inertia)
     assert [len(one) for one in restarted] == [0, 0, 0]
-
-
-@pytest.mark.parametrize(("soon", "begin", "block"), [(False, 40, 7), (True, 20, 1000)])
-def test_three_readings_in_a_row_begin_a_contact_and_end_it(soon: bool, begin: int, block: int) -> None:
-    n, start, stop = 400, 100, 250
-    t_ns = np.arange(n) * 10**6
-    beyond = (np.arange(n) >= start) & (np.arange(n) < stop)
-    readings = np.outer(np.where(np.arange(n) == 200, 9.0, 2.0) * beyond, [0.6, 0.8, 0, 0, 0, 0.1])
-    tracker, in_contact, changes = ContactTracker(RATE_HZ), [], []
-    for i in range(0, n, block):
-        part = slice(i, i + block)
-        m = len(t_ns[part])
-        found, changed = tracker.follow(t_ns[part], beyond[part], readings[part], np.full(m, soon))
-        in_contact.append(found)
-        changes += changed
-    expected = (np.arange(n) >= start + begin) & (np.arange(n) < stop + 40)
-    np.testing.assert_array_equal(np.concatenate(in_contact), expected)
-    began, over = changes
-    assert (began.over, over.over) == (False, True)
-    assert began.begin_ns == over.begin_ns == start * 10**6
-    assert over.last_ns == (stop - 1) * 10**6
-    assert over.peak_N == pytest.approx(9.0)
-    np.testing.assert_allclose(over.peak, readings[200])
-    assert tracker.end() == []

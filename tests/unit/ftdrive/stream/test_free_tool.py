@@ -14,7 +14,6 @@ from ftdrive.stream.samples import StreamEvent, Tracked
 
 NOISE = np.repeat([0.08, 0.004], 3)
 G_M_S2, WINDOW_S = 9.81, 0.15
-UNIT = np.repeat([1.0, 0.03], 3)
 DRIFT = np.array([0.8, -0.5, 0.33, 0.02, 0.01, -0.02]) / 3600
 """1 N an hour."""
 
@@ -148,29 +147,6 @@ def test_a_contact_that_grows_slowly_is_reported_once_and_covered_by_the_sigma()
     assert (off[:3] < 0.05).all()
 
 
-def test_the_offset_of_a_free_tool_is_another_one_after_a_turn_and_a_tare_can_be_undone() -> None:
-    error, systematic = np.array([0.3, -0.1, 0.2, 0.004, 0.003, -0.002]), np.diag(np.square(0.2 * UNIT))
-    tracker, rng = free_tool(), np.random.default_rng(11)
-    for k in range(60):
-        residual = error + NOISE / 4 * rng.standard_normal(6)
-        tracker.update(replace(at_rest(0.15 * k, residual), systematic=systematic))
-    turned = Rotation.from_rotvec([0, 0.25, 0]).as_matrix()
-    here, C_here = tracker.offset(systematic, np.eye(3))
-    there, C_there = tracker.offset(systematic, turned)
-    away, C_away = tracker.offset(systematic, Rotation.from_rotvec([0, 3.1, 0]).as_matrix())
-    np.testing.assert_allclose(here, error, atol=0.02)
-    np.testing.assert_allclose(there, np.exp(-0.5) * error, atol=0.05)
-    assert (np.abs(away) < 0.15 * np.abs(error) + 0.01).all()
-    assert (np.diag(C_here) < 0.02 * np.diag(systematic)).all()
-    np.testing.assert_allclose(np.diag(C_there), (1 - np.exp(-1.0)) * np.diag(systematic), rtol=0.2)
-    np.testing.assert_allclose(np.diag(C_away), np.diag(systematic), rtol=0.1)
-    tracker.tare(error + UNIT, np.diag(NOISE**2), systematic, np.eye(3))
-    np.testing.assert_allclose(tracker.offset(systematic, np.eye(3))[0], 0.0, atol=0.05)
-    tracker.undo_tare(-error - UNIT)
-    np.testing.assert_allclose(tracker.offset(systematic, np.eye(3))[0], here)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("rate_N_h", [0.0, 20.0])
 def test_the_rate_of_a_drift_has_an_honest_sigma_and_is_reported_once(rate_N_h: float) -> None:
     squares, reported = [], 0
@@ -184,13 +160,3 @@ def test_the_rate_of_a_drift_has_an_honest_sigma_and_is_reported_once(rate_N_h: 
         squares.append(((found - rate_N_h) / sigma_N_h) ** 2)
     assert np.mean(squares) < (3.0 if rate_N_h else 6.0)  # without a drift three axes count
     assert reported == (4 if rate_N_h else 0)
-
-
-@pytest.mark.parametrize("walk_N", [0.1, 3.0])
-def test_the_bias_walks_and_drifts_between_looks(walk_N: float) -> None:
-    tracker = free_tool(walks_N=(walk_N,))
-    tracker.update(replace(WINDOW, t_s=100.0))
-    tracked = tracker.update(replace(WINDOW, t_s=1900.0))
-    variance = walk_N**2 / 2 + 5.0**2 / 4
-    np.testing.assert_allclose(tracked.sigma, np.sqrt(variance) * UNIT, rtol=1e-3)
-    assert tracked.walk_N == pytest.approx(walk_N)

@@ -1,12 +1,11 @@
 """States of motion at their limits, and the wrench of an accelerated load."""
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib.model import Array
-from ftdrive.stream.noise import REST, STATES, MotionTracker
+from ftdrive.stream.noise import REST, MotionTracker
 from tests.unit.ftdrive.stream.simulated import P_FLANGE_SENSOR_M, TRUTH
 
 RATE_HZ, MASS_KG = 1000.0, 1.5
@@ -23,26 +22,6 @@ def follow(angle_rad: Array, p_m: Array | None = None, origin_m: Array = CENTRED
 
 def seconds(duration_s: float) -> Array:
     return np.arange(0, duration_s, 1 / RATE_HZ)
-
-
-@pytest.mark.parametrize(
-    ("speed", "state"),
-    [(0.0098, REST), (0.0104, 1), (0.147, 1), (0.153, 3), (0.393, 3), (0.407, 5), (0.69, 5), (0.71, STATES - 1)],
-)
-def test_speeds_have_classes(speed: float, state: int) -> None:
-    t_s = seconds(0.6)
-    assert follow(speed * t_s)[0][-1] == state
-    lever_m = 0.5 if speed > 0.1 else 1.0  # what counts as motion at all is 0.01 rad/s and 0.01 m/s
-    assert follow(0 * t_s, np.outer(lever_m * speed * t_s, [0.0, -1.0, 0.0]))[0][-1] == state
-
-
-@pytest.mark.parametrize(("turn", "steady"), [(1.0, 1), (0.0, 1)])
-def test_a_change_of_speed_has_its_own_class(turn: float, steady: int) -> None:
-    t_s, omega = seconds(1.2), 20.0
-    for acceleration, state in ((1.4, steady), (1.75, steady + 1)):
-        angle = acceleration / omega**2 * np.sin(omega * t_s)
-        states, _ = follow(turn * angle, np.outer((1 - turn) * 0.5 * angle, [0.6, 0.8, 0.0]))
-        assert states[-1] == state
 
 
 def test_rest_begins_half_a_second_after_the_last_motion_and_a_state_rings_for_less() -> None:

@@ -65,25 +65,3 @@ def test_a_loud_window_and_a_jump_do_not_count(state: int, size: int, kept: bool
     steps = np.diff(means, axis=0)
     steps = steps if kept else steps[np.abs(steps[:, 0]) < 1]
     np.testing.assert_allclose(noise.wander, steps.T @ steps / len(steps), atol=1e-9)
-
-
-def test_what_is_assumed_of_a_state_that_is_not_known() -> None:
-    estimator = NoiseEstimator(RATE_HZ, PULL)
-    assert estimator.of(REST) is None
-    assert estimator.of(3) is None
-    learnt(samples(28), REST, estimator)
-    assert estimator.of(REST) is None  # four readings may be of a motion that is not seen yet
-    learnt(samples(1), REST, estimator)
-    rest = known(estimator)
-    first = 1.0**2 * PULL @ PULL.T  # an acceleration of 1 m/s²
-    np.testing.assert_allclose(known(estimator, 3).reading, 100 * rest.reading + first)
-    np.testing.assert_allclose(known(estimator, 3).sample, rest.sample + first)
-    learnt(2 * samples(8 * 12), 4, estimator)
-    np.testing.assert_allclose(known(estimator, 4).sample, rest.sample + first)  # 24 degrees of freedom are too few
-    learnt(2 * samples(8), 4, estimator)
-    moving = known(estimator, 4)
-    assert moving.dof == 13 * 8 / 4
-    np.testing.assert_allclose(np.diag(moving.sample) / np.diag(TRUE), 4.0, atol=0.6)
-    np.testing.assert_array_equal(moving.wander, rest.wander)
-    np.testing.assert_array_equal(known(estimator, 3).reading, moving.reading)  # that of a faster state
-    np.testing.assert_allclose(known(estimator, 5).sample, rest.sample + first)

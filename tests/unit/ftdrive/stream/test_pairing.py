@@ -1,7 +1,6 @@
 """Times of measurement, interpolated poses, and which sample gets which pose."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,16 +29,6 @@ def stamped(line: SampleClock, count: np.ndarray, t_ns: np.ndarray) -> np.ndarra
     """Times of measurement of samples that arrive in batches of 8."""
     parts = [slice(i, i + 8) for i in range(0, len(count), 8)]
     return np.concatenate([line.stamp(count[part].astype(float), t_ns[part]) for part in parts])
-
-
-@pytest.mark.parametrize("true_Hz", [1004.0, 998.5])
-def test_times_are_those_of_the_measurement_though_batches_come_late(true_Hz: float) -> None:
-    count, t_ns = received(20.0, true_Hz, 8)
-    line = SampleClock(1 / 1000.0, RATE_TOLERANCE)  # the nominal rate is a little wrong
-    stamps = stamped(line, count, t_ns)
-    error_s = (stamps - T0_NS) * 1e-9 - count / true_Hz - 2e-4
-    assert np.abs(error_s[5000:]).max() < 2e-4  # the batches scatter by 2 ms
-    assert (np.diff(stamps) > 0).all()
 
 
 def test_a_restarted_device_begins_a_new_line() -> None:
@@ -87,18 +76,6 @@ def test_a_sample_waits_for_the_pose_unless_the_next_one_is_due() -> None:
     assert len(seq) > 190
 
 
-def test_an_extrapolated_pose_continues_the_last_motion_but_not_over_a_gap() -> None:
-    poses, turn = PoseTrack(), Rotation.from_rotvec(np.outer([0.0, 0.002, 0.004], [0.6, 0.0, 0.8]))
-    for i, t_ns in enumerate((T0_NS, T0_NS + 2_000_000)):
-        poses.add(np.array([t_ns]), np.full((1, 6), i), turn[[i]].as_matrix(), np.full((1, 3), 2.0 * i))
-    assert poses.ahead_ns == 2_000_000
-    q, R, p = poses.at(np.array([T0_NS + 4_000_000]))
-    np.testing.assert_allclose(R[0], turn[2].as_matrix(), atol=1e-12)
-    np.testing.assert_allclose([q[0, 0], p[0, 0]], [2.0, 4.0])
-    poses.add(np.array([T0_NS + 10**9]), np.zeros((1, 6)), turn[[2]].as_matrix(), np.zeros((1, 3)))
-    assert poses.ahead_ns == 10_000_000
-
-
 def test_the_pose_is_that_of_the_measurement() -> None:
     motion, delay_s = Motion(), 0.013
     samples, states = motion.links(2.0, delay_s, rate_Hz=1000.0)
@@ -126,26 +103,6 @@ def recording(delay_s: float, scale: float = 1.0) -> tuple[FtSamples, ArmStates]
 
 PUSHED = np.zeros((6000, 6))
 PUSHED[1500:2500, :3] = np.array([5.0, -8.0, 3.0]) * np.sin(np.arange(1000) * 0.02)[:, None]
-
-
-@pytest.mark.parametrize(
-    ("delay_s", "added", "poses", "p_flange_sensor_m", "most_s"),
-    [
-        (-0.015, 0.0, 6, P_FLANGE_SENSOR_M, 5e-5),
-        (0.01, PUSHED, 6, P_FLANGE_SENSOR_M, 5e-5),
-        (0.01, 0.0, 24, np.full(3, np.nan), 1e-4),
-    ],
-    ids=["early", "a touch", "an unknown height"],
-)
-def test_the_delay_between_the_links_is_found_from_motion(
-    delay_s: float, added: Any, poses: int, p_flange_sensor_m: np.ndarray, most_s: float
-) -> None:
-    estimator = DelayEstimator(calibrated(poses), p_flange_sensor_m, window=60)
-    samples, states = recording(delay_s)
-    pushed = FtSamples.of(samples.t_host_ns, samples.seq, samples.wrench + added)
-    estimator.learn([pushed], lambda: [states])
-    assert estimator.delay_s == pytest.approx(delay_s, abs=max(6 * estimator.sigma_s, most_s))
-    assert estimator.sigma_s < 2e-4
 
 
 def test_an_arm_at_rest_shows_no_delay() -> None:

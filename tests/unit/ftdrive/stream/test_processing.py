@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.after.series import BiasTemperature
 from ftcalib.model import Array, predict
-from ftcalib.result import MotionResult
 from ftcalib.sensor_matrix import SensorMatrix, ranges
 from ftdrive.errors import ConfigError
 from ftdrive.stream import processing
@@ -28,7 +27,6 @@ from tests.unit.ftdrive.stream.simulated import (
     R_FLANGE_TCP,
     T0_NS,
     TRUTH,
-    Motion,
     calibrated,
     dwells,
     info,
@@ -167,25 +165,6 @@ def test_inertia_leaves_only_noise_of_a_moving_tool() -> None:
     assert len(static.seq) - len(dynamic.seq) <= 18  # milliseconds
 
 
-def test_a_known_inertia_tensor_is_subtracted_too() -> None:
-    tensor = np.diag([0.01, 0.02, 0.03])
-    rows = moving(3.0)
-    _, point = processed(rows, block=500, settings=Stages(inertia=True))
-    in_motion = replace(calibrated(), motion=MotionResult(tensor, 0.0, 0.03, np.eye(23), 1.0))
-    processor = Processor(info(in_motion))
-    assert processor.settings.inertia, "a stage that is on where the calibration has what it needs"
-    body = run(processor, rows, 500)
-    difference = body.wrench - point.wrench
-    assert np.abs(difference[:, :3]).max() < 1e-9
-    t_s, h = np.arange(0, 3, 1e-3), 1e-4
-    R = [Motion().pose(t_s + k * h)[0] @ calibrated().R_flange_sensor for k in (-1, 0, 1)]
-    rotvec = [Rotation.from_matrix(np.swapaxes(R[1], 1, 2) @ R[k]).as_rotvec() for k in (0, 2)]
-    omega, alpha = (rotvec[1] - rotvec[0]) / (2 * h), (rotvec[1] + rotvec[0]) / h**2
-    expected = alpha @ tensor + np.cross(omega, omega @ tensor)
-    n = len(difference)
-    np.testing.assert_allclose(difference[30 : n - 30, 3:], expected[30 : n - 30], atol=0.02 * np.abs(expected).max())
-
-
 # -------------------------------------------------------------------------------------------------- noise and contact
 
 
@@ -242,24 +221,6 @@ def test_neither_the_filter_of_a_sensor_nor_drift_make_contacts_and_a_push_of_1_
     onsets = np.flatnonzero(np.diff(block.in_contact, prepend=False) & block.in_contact)
     assert len(onsets) == len(starts)
     assert ((onsets > starts) & (onsets <= starts + 50)).all()
-
-
-def test_a_moving_arm_with_a_free_tool_is_no_contact_from_its_first_motion_on() -> None:
-    """Its inertia is not subtracted, and the wrench is 3 ms late."""
-
-    class FromRest(Motion):
-        def pose(self, t_s: Array) -> tuple[Array, Array]:
-            moving_s = np.maximum(t_s - 2.0, 0.0)
-            return super().pose(moving_s**2 / (moving_s + 1.0))
-
-    t_s, motion = np.arange(0, 12, 1e-3), FromRest(0.5, 0.5)
-    R, p = motion.pose(t_s)
-    raw = motion.wrench(t_s - 0.003) + NOISE * np.random.default_rng(3).normal(size=(len(t_s), 6))
-    raw[9000:9500, 0] += 8.0
-    _, block = processed(replace(paired(R), raw=raw, p_base_flange_m=p))
-    assert not block.in_contact[:9000].any()
-    assert block.in_contact[9200:9500].all()
-    assert not block.in_contact[9700:].any()
 
 
 # ------------------------------------------------------------------------------------------------------ tare and drift

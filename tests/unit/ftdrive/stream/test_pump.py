@@ -6,9 +6,8 @@ from typing import Any, cast
 
 import pytest
 
-from ftdrive.errors import exit_code
 from ftdrive.stream.samples import Block, StreamEvent
-from ftdrive.stream.stream import RECOVER_S, Sink, pump
+from ftdrive.stream.stream import Sink, pump
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.servers.fake_stream import RATE_HZ, FakeStream, block
@@ -81,15 +80,6 @@ def test_an_interruption_is_said_once_and_each_sink_gets_all_blocks_and_events()
     for sink in sinks:
         assert (sink.got, sink.events, sink.calls) == (".--.-.-", "axxbxclast", ["begin", "end"])
     assert run(Source("axb")) == [], "without words for it nothing is said"
-
-
-@pytest.mark.parametrize(("patience_s", "failures"), [(0.0, 1), (RECOVER_S, 35)])
-def test_a_failure_that_lasts_is_raised_after_the_last_events(patience_s: float, failures: int) -> None:
-    sink = Output(source := Source("a" + "x" * 50))
-    with pytest.raises(DeviceTimeout) as failure:
-        run(source, sink, patience_s=patience_s)
-    assert exit_code(failure.value) == 4
-    assert (len(sink.events), sink.calls) == (1 + failures, ["begin", "end"])
 
 
 def test_a_sink_that_fails_is_ended_and_said_and_the_others_go_on() -> None:

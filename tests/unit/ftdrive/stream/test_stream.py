@@ -147,20 +147,6 @@ def until(stream: Stream, done: Callable[[], bool]) -> None:
     pytest.fail("it never happened")
 
 
-def test_every_sample_arrives_once_with_its_pose(cell: Cell) -> None:
-    with cell.stream() as stream:
-        blocks = [stream.read() for _ in range(100)]
-    seq = np.concatenate([block.seq for block in blocks])
-    assert (np.diff(seq) == 1).all()
-    assert len(seq) > 1000
-    wrench = np.concatenate([block.wrench for block in blocks])
-    assert np.sqrt(np.square(wrench).mean(axis=0)) == pytest.approx(NOISE, rel=0.1)
-    assert blocks[-1].sigma == pytest.approx(NOISE, rel=0.15)
-    assert stream.info.sensor_rate_Hz == pytest.approx(1000, rel=0.01)
-    assert stream.info.arm_rate_Hz == pytest.approx(500, rel=0.01)
-    assert [event.kind for event in stream.take_events()] == []
-
-
 @pytest.mark.parametrize("device", ["sensor", "arm"])
 def test_a_silent_device_raises_and_recovers_with_events(cell: Cell, device: str) -> None:
     link: Link = getattr(cell, device)

@@ -1,8 +1,6 @@
 """Weighing a stream: rest, refusals, tare as the zero, poses, parts."""
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from ftcalib import CalibrationResult
 from ftcalib.model import Array
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.errors import ConfigError
-from ftdrive.stream.noise import unexplained_variance
 from ftdrive.stream.samples import Paired
 from ftdrive.stream.stream import Stream
 from ftdrive.stream.weighing import WORDS, CannotWeigh, Scale, count_of, load_values, weigh_in_motion
@@ -191,14 +188,6 @@ def test_parts_are_counted_or_not() -> None:
     assert refusal.value.code == "count"
     with pytest.raises(CannotWeigh):
         count_of(weight, 0.001)  # sigma is larger than such a part
-
-
-def test_what_a_fit_does_not_explain_is_in_the_reading() -> None:
-    for explained, variance in ((True, np.zeros(6)), (False, np.repeat([(0.05**2 - 0.03**2) / 3, 0.0], 3))):
-        calibration: Any = SimpleNamespace(
-            noise_explains=explained, likely_error=lambda _: (0.05, 0.002), predicted_error=lambda: (0.03, 0.003)
-        )
-        np.testing.assert_allclose(unexplained_variance(calibration), variance)
 
 
 def test_weighing_in_motion_needs_a_stream_that_follows() -> None:

@@ -45,13 +45,6 @@ def test_no_line_end_and_nothing_above_the_names_loses_a_row(name: str, tmp_path
         np.testing.assert_array_equal(rows_of(path, name), expected)
 
 
-def test_other_breaks_inside_cells_are_blanks(tmp_path: Path) -> None:
-    path = tmp_path / "t.csv"
-    for mark in NO_ENDS:
-        path.write_text(PLAIN.replace(",fx", f",{mark}fx", 1).replace("\n0.0,", f"\n{mark}0.0,", 1), encoding="utf-8")
-        np.testing.assert_allclose(Table(path).dataset().wrench, POSES.wrench)
-
-
 @pytest.mark.parametrize(
     ("above", "decimal"), [("point", ","), ("comma", "."), ("semicolons", ","), ("tabs", ","), ("spaces", ".")]
 )

@@ -12,7 +12,7 @@ from ftcalib import BadDataset, Known, solve
 from ftcalib.data.dataset import Orientation
 from ftdrive.runs.source import _forward
 from ftdrive.tables.table import Table, TableOptions
-from tests.unit.ftdrive.tables.test_layouts import POSES, RECORDING, columns, position, quaternion, t, wrench
+from tests.unit.ftdrive.tables.test_layouts import POSES, RECORDING, columns, quaternion, t, wrench
 
 MATRIX = "r11 r12 r13 r21 r22 r23 r31 r32 r33"
 IDENTITY = "1,0,0,0,1,0,0,0,1"
@@ -38,19 +38,6 @@ def test_a_matrix_is_row_major_and_orientation_defines_the_mapping(tmp_path: Pat
         table.dataset("x")  # type: ignore[arg-type]  # the point of the test
 
 
-def test_columns_stand_in_any_order_beside_others(tmp_path: Path) -> None:
-    data = csv(
-        tmp_path,
-        "\ufeffname, tz,ty,tx,fz,fy,fx,rz,ry,rx,t",
-        f"a,6,5,4,3,2,1,{np.pi / 2},0,0,10",
-        "",
-        "b,6,5,4,3,2,1,0,0,0,12.5",
-    ).dataset()
-    np.testing.assert_allclose(data.R_base_flange[0] @ [1, 0, 0], [0, 1, 0], atol=1e-15)
-    np.testing.assert_array_equal(data.wrench[1], [1, 2, 3, 4, 5, 6])
-    np.testing.assert_array_equal(data.t_s, [0, 2.5])
-
-
 @pytest.mark.parametrize("orientation", ["R_base_flange", "R_flange_base"])
 def test_quaternion_and_vector_are_those_of_the_matrix(orientation: Orientation) -> None:
     poses = Rotation.random(5, rng=1)
@@ -59,12 +46,6 @@ def test_quaternion_and_vector_are_those_of_the_matrix(orientation: Orientation)
     read = [Table(free | columns(*form)).dataset(orientation).R_base_flange for form in forms.items()]
     expected = poses if orientation == "R_base_flange" else poses.inv()
     np.testing.assert_allclose(read, [expected.as_matrix()] * 3, atol=1e-12)
-
-
-def test_the_first_complete_orientation_counts(tmp_path: Path) -> None:
-    names = "r11,rx,ry,rz,qx,qy,qz,qw,fx,fy,fz,tx,ty,tz"
-    data = csv(tmp_path, names, "7,0,0,0,0,0,1,0,1,2,3,4,5,6").dataset()
-    np.testing.assert_allclose(data.R_base_flange[0], np.diag([-1, -1, 1]))
 
 
 def test_standard_errors_become_the_covariance(tmp_path: Path) -> None:
@@ -166,19 +147,6 @@ def test_a_named_unit_beats_the_numbers() -> None:
     assert given.rate_Hz("wrench") == pytest.approx(5e5)
 
 
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        (position(POSES, size=1e-3), "positions in mm"),
-        (position(POSES), ""),
-        ({f"{name} [mm]": values for name, values in position(POSES, size=1e-3).items()}, ""),
-        (columns("x y z", np.full((24, 3), 9.9)), ""),
-    ],
-)
-def test_positions_in_mm_are_found(table: dict[str, Any], words: str) -> None:
-    assert Table(t(POSES) | wrench(POSES) | quaternion(POSES) | table).words == words
-
-
 def test_rows_that_follow_quickly_or_two_streams_are_in_motion() -> None:
     slow = {"t": 0.5 * np.arange(len(RECORDING.t_s))}
     assert Table(t(RECORDING) | MOVING).in_motion
@@ -221,14 +189,6 @@ def test_successive_rows_at_rest_in_one_orientation_are_one_pose() -> None:
     assert table.words == "240 rows at rest are 5 poses"
 
 
-def test_correlated_samples_of_a_dwell_count_less() -> None:
-    rows, _ = dwells(200, 200)
-    slow = np.convolve(np.random.default_rng(1).normal(size=409), np.ones(10) / np.sqrt(10), "valid")
-    cov = Table(rows | {"fx": 0.01 * slow, "fy": rows["fy"]}).dataset().wrench_cov
-    assert cov is not None
-    assert cov[:, 0, 0].mean() > 3 * cov[:, 1, 1].mean()
-
-
 def test_a_step_of_the_wrench_begins_another_pose() -> None:
     rows, _ = dwells(100, 100, steps=[130])
     data = Table(rows).dataset()
@@ -250,12 +210,6 @@ def test_ordinary_tables_have_one_row_per_pose(turned_deg: float) -> None:
     assert len(data) == len(rows["fx"])
     assert data.wrench_cov is None
     assert not data.n_samples.any()
-
-
-def test_rows_with_standard_errors_are_poses() -> None:
-    rows, _ = dwells(100, 100)
-    sigma = columns("sigma_fx sigma_fy sigma_fz sigma_tx sigma_ty sigma_tz", np.full((200, 6), 0.01))
-    assert len(Table(rows | sigma).dataset()) == 200
 
 
 def test_a_slow_turn_is_no_single_pose() -> None:

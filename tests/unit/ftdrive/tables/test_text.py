@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ftcalib.errors import BadDataset
-from ftdrive.tables.table import SignalRows, Table
+from ftdrive.tables.table import Table
 from ftdrive.tables.text import TextTable
 
 ROWS = st.lists(st.lists(st.floats(allow_nan=False), min_size=3, max_size=3), min_size=1, max_size=9)
@@ -38,28 +38,6 @@ def test_a_number_may_be_written_in_several_ways(line: str, tmp_path: Path) -> N
     (block, share), *_ = TextTable(tmp_path / "t.csv").blocks([0, 1, 2])
     np.testing.assert_array_equal(block[1], [1.5, 0.5, 2])
     assert share == 1.0
-
-
-@pytest.mark.slow
-def test_a_long_table_is_read_in_parts_up_to_its_fault(tmp_path: Path) -> None:
-    path = tmp_path / "w.csv"
-    rows = np.c_[np.arange(60_000) / 1000, np.random.default_rng(3).normal(0, 10, (60_000, 6))]
-    with path.open("w") as file:
-        file.write("seq,t,fx,fy,fz,tx,ty,tz\n")
-        np.savetxt(file, np.c_[np.arange(len(rows)), rows], delimiter=",")
-    parts = list(Table(path).wrenches())
-    assert len(parts) > 2
-    np.testing.assert_array_equal(np.concatenate([part.t_s for part in parts]), rows[:, 0])
-    np.testing.assert_array_equal(np.concatenate([part.values for part in parts]), rows[:, 1:])
-    assert parts[-1].place == 1.0
-    assert Table(path).rate_Hz("wrench") == pytest.approx(1000)
-    content = path.read_text()
-    for line, words in (("1,4,1,2,3,4,5,6.7.8", r"tz is '6\.7\.8', which is not a number"), ("1,4", "has 2 values")):
-        path.write_text(f"{content}{line}\n")
-        valid: list[SignalRows] = []
-        with pytest.raises(BadDataset, match=rf"w\.csv: line 60002.*{words}.*correct or delete"):
-            valid.extend(Table(path).wrenches())
-        assert 0 < len(valid) < len(parts)
 
 
 def test_a_first_row_without_end_is_refused_in_a_line(tmp_path: Path) -> None:

@@ -5,28 +5,11 @@ from pathlib import Path
 import pytest
 
 from ftdrive import cli
-from ftdrive.terminal.console import indented
-from ftdrive.words.text import as_typed
 
 
 @pytest.fixture
 def _started_by_uv(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UV_RUN_RECURSION_DEPTH", "1")
-
-
-@pytest.mark.parametrize(
-    ("words", "typed"),
-    [
-        ("run `ftdrive plan`, then ftdrive doctor", "run `uv run ftdrive plan`, then uv run ftdrive doctor"),
-        ("undo: ftdrive push --restore a", "undo: uv run ftdrive push --restore a"),
-        ("uv run ftdrive demo", "uv run ftdrive demo"),
-        ("this ftdrive uses version 3, see /opt/ftdrive plan", "this ftdrive uses version 3, see /opt/ftdrive plan"),
-    ],
-)
-@pytest.mark.usefixtures("_started_by_uv")
-def test_with_uv_every_command_begins_with_it(words: str, typed: str) -> None:
-    assert as_typed(words) == typed
-    assert indented(" ! ", words).plain.split() == ["!", *typed.split()]
 
 
 @pytest.mark.usefixtures("_started_by_uv")

@@ -1,9 +1,7 @@
 """Output for people: texts are printed unchanged, -q omits them, errors of the system become sentences."""
 
-import io
 import logging
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -13,7 +11,6 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 from syrupy.assertion import SnapshotAssertion
@@ -24,7 +21,7 @@ from ftdrive.cli import run as cli_run
 from ftdrive.errors import Declined, in_a_sentence
 from ftdrive.planning import planner
 from ftdrive.planning.plan import Plan
-from ftdrive.terminal.console import answer, indented, messages
+from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.lines import Line
 from ftdrive.terminal.text import echo, in_whole_words, print_table
 from ftdrive.words.text import visible
@@ -51,20 +48,6 @@ def test_brackets_and_colons_are_no_markup(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr("ftdrive.commands.calibrate.run_calibration", guide)
     assert text in run(*HELD).stderr
-
-
-@pytest.mark.parametrize("width", [40, 80])
-def test_what_is_longer_than_the_terminal_goes_on_under_its_first_word(width: int) -> None:
-    console = Console(width=width, file=io.StringIO(), color_system=None)
-    words = " ".join(f"word{k}" for k in range(30))
-    console.print(indented("  head: ", words, console))
-    assert isinstance(console.file, io.StringIO)
-    first, *others = console.file.getvalue().splitlines()
-    assert first.startswith("  head: word0 ")
-    assert others
-    assert all(re.match(r" {8}word\d", line) and len(line) <= width for line in others)
-    assert " ".join([first.removeprefix("  head: ").strip(), *map(str.strip, others)]) == words
-    assert indented("head: ", words, Console(width=width, soft_wrap=True)).plain == f"head: {words}"  # a file
 
 
 def test_help_breaks_no_address_and_cuts_no_sentence() -> None:

@@ -12,9 +12,9 @@ from ftdrive.terminal import live_panels
 from ftdrive.terminal.lines import GOOD, WARNING, Line
 from ftdrive.terminal.live_panels import other_wrench_lines
 from ftdrive.terminal.live_screen import draw_live
-from ftdrive.words.stream import View, line_of_force
+from ftdrive.words.stream import View
 from ftdrivers.interfaces import Fact
-from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, SIGMA, TARE, FakeStream
+from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, TARE, FakeStream
 from tests.unit.ftdrive.words.test_stream import Rig, reading_of
 
 SENSOR = WrenchFrame("sensor", "sensor")
@@ -27,23 +27,6 @@ def view() -> View:
 
 def text(line: Line) -> str:
     return "".join(part.text for part in line.parts)
-
-
-@pytest.mark.parametrize(
-    ("force_N", "at_m", "words"),
-    [
-        ([0, 0, -10], [0.03, 0.0, 0.0], "line of force 30 mm from tcp, +x"),
-        ([0, 5, 0], [0.0004, 0.0, 0.0], "line of force passes through tcp"),
-        ([0, 0, 0.39], [0.03, 0.0, 0.0], ""),
-    ],
-)
-def test_the_line_of_force_passes_where_the_torque_says(
-    force_N: list[float], at_m: list[float], words: str, view: View
-) -> None:
-    wrench = np.concatenate([force_N, np.cross(at_m, force_N)])
-    reading = replace(reading_of(view), wrench=wrench, in_contact=True, sigma=SIGMA)
-    assert line_of_force(reading) == words
-    assert line_of_force(replace(reading, in_contact=False)) == ""
 
 
 def test_range_is_used_by_the_load_where_the_zero_is_arbitrary(view: View) -> None:

@@ -65,15 +65,6 @@ def test_the_headline_promises_no_error_that_the_residuals_refute(method: Method
     assert ("not measured" in error_source(result)) != measured
 
 
-@pytest.mark.slow
-def test_what_was_given_wrongly_is_named_with_what_the_data_say() -> None:
-    finding = solve(tilted(), known=Known(mass_kg=0.61)).findings[0]
-    assert finding.code == "known_mass"
-    assert finding.values["known_kg"] == 0.61
-    assert finding.values["mass_kg"] == pytest.approx(0.49998, rel=0.003)
-    assert 0 < finding.values["sigma_kg"] < 0.02
-
-
 def test_the_printed_result_separates_free_air_and_contact(capsys: pytest.CaptureFixture[str]) -> None:
     result = solve(tilted())
     print_result(result)

@@ -27,13 +27,6 @@ def printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
     return run
 
 
-@pytest.mark.parametrize("columns", [None, 80])
-def test_a_row_is_one_line_where_it_fits_and_in_a_pipe(columns: int | None, printed: Printed) -> None:
-    head, *lines = printed(columns)
-    assert head.removeprefix("\x1b[1m").startswith("cell     tool                        due")
-    assert lines == ["press-4  a gripper with a long name  now", "b                                    in 5 d"]
-
-
 @pytest.mark.parametrize("columns", [26, 22, 12])
 def test_no_word_is_ever_broken(columns: int, printed: Printed) -> None:
     words = {word for row in ROWS for text in row for word in text.split()}

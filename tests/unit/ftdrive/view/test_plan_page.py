@@ -18,7 +18,7 @@ from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
 from ftdrive.view.page import Page
-from ftdrive.view.plan_page import PlanPage, PlanTimeline, describe_move
+from ftdrive.view.plan_page import PlanPage, describe_move
 from ftdrive.view.scene import arm_parts, turned_up
 
 
@@ -67,19 +67,6 @@ def arm_is_at(shown: Shown, q_rad: Any) -> bool:
     parts = parts_of(shown)
     wanted = arm_parts(shown.arm, q_rad)
     return all(np.allclose(parts[name]["at"], part["at"], atol=1e-3) for name, part in wanted.items() if part)
-
-
-def test_the_tour_goes_through_every_pose_in_its_time_and_back(plan: Plan) -> None:
-    tour = PlanTimeline(plan)
-    np.testing.assert_allclose(tour.at(tour.begins_s), plan.nodes_rad)
-    np.testing.assert_allclose(tour.at([0.0, tour.end_s]), plan.nodes_rad[[0, 0]])
-    assert tour.end_s == pytest.approx(plan.motion_time_s)
-    middle_s = tour.begins_s[2] + plan.steps[2].duration_s / 2
-    np.testing.assert_allclose(tour.at(middle_s), plan.nodes_rad[2:4].mean(axis=0))
-    assert [tour.move(float(t_s)) for t_s in tour.begins_s] == list(range(6))
-    assert [describe_move(plan, move)[0].split(",")[0] for move in (0, 5)] == ["Move 1 of 6", "Move 6 of 6"]
-    assert all(np.abs(tour.q_rad - q).max(axis=1).min() < 1e-9 for q in plan.nodes_rad)
-    assert np.abs(np.diff(tour.q_rad, axis=0)).max() < np.radians(7)
 
 
 def test_viewers_step_from_pose_to_pose(shown: Shown, page: Page, plan: Plan) -> None:

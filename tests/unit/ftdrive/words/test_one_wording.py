@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
-import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult
@@ -17,21 +16,16 @@ from ftdrive.report.facts import facts_of
 from ftdrive.report.page import templates, with_code
 from ftdrive.report.sections import capitalized
 from ftdrive.report.subject import Subject
-from ftdrive.runs.calibration import EMULATED, FOREIGN
 from ftdrive.session.events import State, StateChanged
-from ftdrive.terminal.live_screen import draw_live as live_frame
 from ftdrive.terminal.report import print_result
 from ftdrive.terminal.screen import draw_session
-from ftdrive.view.live_page import texts
 from ftdrive.view.outcome import conclude_calibration
 from ftdrive.view.page import Page
 from ftdrive.view.session_page import SessionPage
 from ftdrive.words.session import SessionText, SessionView, state_in_words
-from ftdrive.words.stream import CONTACT, FREE, NOISE_UNKNOWN, StreamSummary, calibration_in_words, state
 from tests.finding_examples import examples
 from tests.unit.ftdrive.exports.example import calibration
 from tests.unit.ftdrive.fake_cell import Scripted
-from tests.unit.ftdrive.terminal.fake_stream import FakeStream, SteppedFeed
 
 
 def read(result: CalibrationResult) -> str:
@@ -97,24 +91,3 @@ def test_every_state_of_a_session_is_worded_alike(state: State) -> None:
     assert event.to_dict()["state"] == state
     for line in SessionText(verbose=True).lines(event):
         assert line.words in {"Tour", "Motion"} or line.words.lower() == f"{state}: {words}"
-
-
-@pytest.mark.parametrize(("said", "mark"), [(FREE, EMULATED), (CONTACT, EMULATED), (NOISE_UNKNOWN, FOREIGN)])
-def test_every_state_of_a_stream_is_worded_alike(said: str, mark: str) -> None:
-    stream = FakeStream("contact", block_s=0.05)
-    stream.info = replace(stream.info, emulated=mark == EMULATED, foreign=mark == FOREIGN)
-    feed = SteppedFeed(stream)
-    summary = StreamSummary(feed)
-    feed.step(240 if said == CONTACT else 20)
-    view = summary.view()
-    if said == NOISE_UNKNOWN and view.reading is not None:
-        view = replace(view, reading=replace(view.reading, chi2=np.nan))
-    screen = "\n".join(map(str, live_frame(view, 120, 40)))
-    page = json.dumps(texts(view, view.live), ensure_ascii=False)
-    assert mark in stream.info.marks
-    assert state(view)[0] == said
-    assert said in screen.lower()
-    assert said in page
-    assert mark in screen
-    assert mark in page
-    assert "".join(text for text, _ in calibration_in_words(view)) in screen

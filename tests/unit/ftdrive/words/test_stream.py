@@ -1,6 +1,5 @@
 """What the model of a stream keeps: means, extremes, contact, and the recent past in memory of fixed size."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +9,10 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
 from ftdrive.stream.feed import History
-from ftdrive.stream.samples import Block, WrenchFrame
+from ftdrive.stream.samples import Block
 from ftdrive.words.stream import ShownWrench, StreamSummary, View
 from tests.unit.ftdrive.terminal.fake_stream import R_BASE_FLANGE, SIGMA, FakeStream, SteppedFeed
 
-MS = 1_000_000
 BEGIN_NS = 5_000_000_000_000
 
 
@@ -42,48 +40,6 @@ def test_numbers_are_the_mean_of_the_last_tenth_of_a_second() -> None:
     view = rig.summary.view()
     np.testing.assert_allclose(reading_of(view).wrench, np.concatenate([block.wrench for block in last]).mean(axis=0))
     np.testing.assert_allclose(reading_of(view).raw, np.concatenate([block.raw for block in last]).mean(axis=0))
-
-
-def test_a_recording_that_goes_back_between_two_drawings_leaves_nothing_in_the_mean() -> None:
-    rig = Rig(FakeStream("contact", block_s=0.05))
-    rig.feed.step(240)  # in contact, with 5 N
-    rig.stream.blocks = 20
-    reading = reading_of(rig.run(1))
-    assert not reading.in_contact
-    assert np.abs(reading.wrench).max() < SIGMA[0]
-
-
-def test_peaks_are_of_single_samples_until_they_are_reset() -> None:
-    rig = Rig(FakeStream(block_s=0.05))
-    view = rig.run(124)  # a push of 8 N
-    assert view.peaks.high[2] == pytest.approx(7.8, abs=0.3)
-    assert view.peaks.sizes[0] == pytest.approx(8.1, abs=0.2)
-    rig.summary.reset_peaks()
-    assert rig.run(10).peaks.high[2] < 7 * SIGMA[0]
-
-
-def test_contact_lasts_from_its_first_sample() -> None:
-    view = Rig(FakeStream("contact", block_s=0.05)).run(240)
-    assert view.contact_s == pytest.approx(12.0 - 11.604, abs=0.005)
-
-
-@pytest.mark.parametrize(
-    ("change", "keeps_history"),
-    [
-        (lambda stream: setattr(stream, "frame", WrenchFrame()), False),
-        (lambda stream: setattr(stream, "stages", replace(stream.stages, gravity=False)), True),
-    ],
-)
-def test_extremes_of_another_frame_or_stage_are_forgotten(
-    change: Callable[[FakeStream], None], keeps_history: bool
-) -> None:
-    rig = Rig(FakeStream(block_s=0.05))
-    rig.run(124)
-    change(rig.stream)
-    view = rig.run(1)
-    assert reading_of(view).frame == rig.stream.frame
-    assert np.ptp([view.peaks.low, view.peaks.high], axis=0).max() < 12 * SIGMA[0]
-    assert np.isfinite(view.columns(100).low[:, 50]).all() == keeps_history
 
 
 def test_a_frozen_screen_stands_still() -> None:
@@ -138,14 +94,6 @@ def test_noise_is_not_judged_while_the_arm_moves() -> None:
     assert not view.checks
 
 
-def test_an_event_that_repeats_is_one_line() -> None:
-    rig = Rig(FakeStream())
-    for text in ("a", "b", "b", "b"):
-        rig.feed.note(text)
-    view = rig.run(1)
-    assert [(note.text, note.times) for note in view.notes] == [("b", 3), ("a", 1)]
-
-
 def test_a_failed_check_is_among_the_events() -> None:
     check = Check("calibration.devices", "failed", "the calibration was made with the sensor A", "ftdrive calibrate")
     view = Rig(FakeStream(), None, check).run(1)
@@ -175,39 +123,3 @@ def test_each_column_has_the_extremes_of_its_own_time(n: int) -> None:
         np.testing.assert_array_equal(columns.high[:, column], inside.max(axis=0))
         assert columns.in_contact[column] == (inside[:, 0] > 2.5).any()
     assert columns.marks == {n - 1}
-
-
-def test_a_column_does_not_change_when_time_goes_on() -> None:
-    history, t_ns, _ = filled(2.0, 3.0, 1000)
-    before = history.columns(int(t_ns[-1]), 100)
-    later_ns = int(t_ns[-1]) + 3 * before.column_ns
-    history.add(np.array([later_ns]), np.full((1, 6), 50.0), np.array([False]))
-    after = history.columns(later_ns, 100)
-    assert after.start_ns == before.start_ns + 3 * before.column_ns
-    np.testing.assert_array_equal(after.low[:, :96], before.low[:, 3:99])
-
-
-def test_what_was_not_sampled_stays_empty() -> None:
-    history, t_ns, _ = filled(10.0, 1.0, 1000)
-    columns = history.columns(int(t_ns[-1]), 100)
-    assert np.isnan(columns.low[:, :85]).all()
-    assert np.isfinite(columns.high[:, -8:]).all()
-    history.clear()
-    assert np.isnan(history.columns(int(t_ns[-1]), 100).low).all()
-
-
-def test_a_recording_that_goes_back_shows_what_was_there() -> None:
-    history, t_ns, wrench = filled(2.0, 3.0, 1000)
-    then = history.columns(int(t_ns[2500]), 100)
-    rows = slice(2384, 2501)
-    history.add(t_ns[rows], wrench[rows], wrench[rows, 0] > 2.5)
-    again = history.columns(int(t_ns[2500]), 100)
-    np.testing.assert_array_equal(then.high[:, :-1], again.high[:, :-1])
-
-
-def test_memory_is_flat() -> None:
-    history, t_ns, _ = filled(2.0, 1.0, 1000)
-    size = sum(value.nbytes for value in vars(history).values() if isinstance(value, np.ndarray))
-    for k in range(1, 50):
-        history.add(t_ns + k * 1000 * MS, np.zeros((len(t_ns), 6)), np.zeros(len(t_ns), np.bool_))
-    assert size == sum(value.nbytes for value in vars(history).values() if isinstance(value, np.ndarray)) < 250_000

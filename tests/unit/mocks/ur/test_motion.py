@@ -1,12 +1,10 @@
 """How the emulated arm moves: trapezoids on time, no jumps whatever is commanded, one owner at a time."""
 
-import math
-
 import numpy as np
 import pytest
 
-from ftmocks.kinematics import MODELS, Vector6, forward, matrix_of, pose_of, rotvec, vector6
-from ftmocks.ur.motion import Arm, JointMove, LineMove, Trapezoid
+from ftmocks.kinematics import MODELS, Vector6, vector6
+from ftmocks.ur.motion import Arm, JointMove, Trapezoid
 
 DH = MODELS["UR5e"]
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
@@ -46,23 +44,6 @@ def test_trapezoid_takes_length_over_speed_plus_one_ramp(
         assert rate.min() >= -1e-9
         assert rate.max() <= speed + 1e-9
         assert np.abs(np.diff(rate)).max() / np.diff(times)[0] <= acceleration * 1.01
-
-
-def test_movel_moves_the_tcp_on_a_straight_line() -> None:
-    arm = Arm(DH, HOME)
-    X_flange_tcp = matrix_of([0.0, 0.02, 0.15, 0.1, 0.2, 0.3])
-    start = forward(DH, HOME) @ X_flange_tcp
-    goal = start.copy()
-    goal[:3, 3] += [0.05, -0.1, -0.05]
-    arm.start(LineMove(DH, X_flange_tcp, goal, 0.25, 1.2), "main")
-    direction = np.array([0.05, -0.1, -0.05]) / math.hypot(0.05, 0.1, 0.05)
-    while arm.busy:
-        arm.step(DT)
-        here = forward(DH, arm.q) @ X_flange_tcp
-        off_line = (here[:3, 3] - start[:3, 3]) - direction * float(direction @ (here[:3, 3] - start[:3, 3]))
-        assert math.hypot(*off_line) < 1e-9
-        assert math.hypot(*rotvec(here[:3, :3] @ start[:3, :3].T)) < 1e-9
-    assert pose_of(forward(DH, arm.q) @ X_flange_tcp) == pytest.approx(pose_of(goal), abs=1e-9)
 
 
 def test_stopj_takes_speed_over_deceleration() -> None:

@@ -286,22 +286,6 @@ def along(axis: str, centre: tuple[float, float, float], half_m: float, radius_m
     return one(centre, np.eye(3)["xyz".index(axis)], half_m, radius_m, rounding_m)
 
 
-@pytest.mark.parametrize(
-    ("other", "distance_m"),
-    [
-        (along("z", (0.0, 0.0, 0.5), 0.2, 0.03, 0.02), 0.2),  # lid to lid
-        (along("x", (0.0, 0.0, 0.3), 0.2, 0.03, 0.02), 0.17),  # side to lid
-        (along("x", (0.0, 0.2, 0.0), 0.4, 0.03, 0.02), 0.12),  # side to side, crossed
-        (along("z", (0.3, 0.0, 0.4), 0.1, 0.05, 0.02), np.hypot(0.2, 0.2)),  # rim to rim
-        (along("z", (0.3, 0.4, 0.0), 0.1, 0.0, 0.02), 0.45),  # side to a capsule
-    ],
-)
-def test_distances_of_cylinders_by_hand(other: Bodies, distance_m: float) -> None:
-    body = along("z", (0.0, 0.0, 0.0), 0.1, 0.05, 0.01)
-    for pair in ((body, other), (other, body)):
-        assert separation(*pair, np.array([np.inf]))[0] == pytest.approx(distance_m - 0.03, abs=2e-5)
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_what_is_too_near_is_named_just_where_a_posture_is_not_free(seed: int) -> None:
     rng = np.random.default_rng(seed)

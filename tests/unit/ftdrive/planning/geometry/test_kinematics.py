@@ -56,25 +56,6 @@ def test_the_wrist_alone_gives_the_orientation_in_two_ways(q: list[float]) -> No
     assert found[0, 4] >= 0 >= found[1, 4]
 
 
-@pytest.mark.parametrize("q5", [0.0, np.pi])
-def test_where_axes_4_and_6_are_parallel_the_wrist_turns_with_axis_4(q5: float) -> None:
-    q = [0.3, -1.2, 0.8, 0.5, q5, 0.9]
-    R = frames(MODELS["UR3e"], q).R_base_flange
-    found = wrist_inverse(MODELS["UR3e"], q[:3], R)[0]
-    assert np.array_equal(found[:, 5], [0, 0])
-    assert np.allclose(frames(MODELS["UR3e"], found).R_base_flange, R, atol=1e-12)
-
-
-@pytest.mark.parametrize("kinematics", OWN)
-def test_own_kinematics_agree_with_the_chain_of_links(kinematics: Kinematics) -> None:
-    q = random_joints(20)
-    found = frames(kinematics, q)
-    for i, one in enumerate(q):
-        pose = forward(kinematics, one)
-        assert np.allclose(found.R_base_flange[i], pose.R, atol=1e-12)
-        assert np.allclose(found.flange_m[i], pose.p_m, atol=1e-12)
-
-
 @pytest.mark.parametrize("arm", real_arms(), ids=lambda arm: str(arm.number))
 def test_parameters_of_real_arms_give_the_pose_of_their_links(arm: RealArm) -> None:
     kinematics = of_dh(arm.dh())

@@ -8,13 +8,11 @@ from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.approach import plan_approach
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.geometry.kinematics import frames
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, _plan_box, _plan_cone, guess_of, plan_tour
-from ftdrive.planning.search.nodes import NUMBERS, WINDOW_RAD, constant_tour
-from ftdrivers.ur.kinematics import MODELS
+from ftdrive.planning.search.nodes import NUMBERS, WINDOW_RAD
 
 TOOL = (Cylinder(0, 0.2, 0.1),)
 LUMP = (*TOOL, Cylinder(0.05, 0.1, 0.03, 0.06, 0.0))
@@ -30,15 +28,6 @@ def sampled_clear(certifier: Certifier, plan: Plan) -> bool:
     return bool(certifier.free(((1 - share) * q + share * np.roll(q, -1, axis=0)).reshape(-1, 6)).all())
 
 
-@pytest.mark.parametrize(("model", "pan_deg"), [("UR3e", 45.0), ("UR20", -133.0)])
-def test_constant_tour_visits_every_orientation_of_the_paper_turned_by_the_pan(model: str, pan_deg: float) -> None:
-    tour = constant_tour(np.radians([pan_deg, -100, 60, -50, 90, 45]))
-    pan = np.radians(pan_deg - 45)
-    Y = np.array([[np.cos(pan), -np.sin(pan), 0], [np.sin(pan), np.cos(pan), 0], [0, 0, 1]])
-    assert sorted(NUMBERS) == list(range(1, 25))
-    assert np.allclose(frames(MODELS[model], tour).R_base_flange, Y @ special(NUMBERS), atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("model", "q6_deg", "poses"), [pytest.param("UR5e", -170, 24, marks=pytest.mark.slow), ("UR3e", 80, 12)]
 )
@@ -50,14 +39,6 @@ def test_wrist_3_stays_within_200_degrees_of_where_it_stands(model: str, q6_deg:
     assert np.degrees(np.abs(q[:, 5] - stands[5]).max()) <= 200 + 1e-6
     assert sampled_clear(certifier, plan)
     assert sorted(step.number for step in plan.steps) == sorted(NUMBERS if poses == 24 else T12)
-
-
-@pytest.mark.parametrize(("q2", "q3", "q4"), [(-100, 60, -50), (-100, 60, 310), (-60, -120, 200), (-350, -340, 0)])
-def test_wrist_1_starts_near_where_it_stands_and_stays_in_its_range(q2: float, q3: float, q4: float) -> None:
-    wrist_1 = np.degrees(constant_tour(np.radians([45, q2, q3, q4, 90, 45]))[:, 3])
-    assert np.abs(wrist_1).max() <= 360 + 1e-9
-    others = [wrist_1[0] + turn for turn in (-360, 360) if np.abs(wrist_1 + turn).max() <= 360]
-    assert all(abs(wrist_1[0] - q4) <= abs(other - q4) for other in others)
 
 
 @pytest.mark.parametrize(
