@@ -77,23 +77,3 @@ def test_a_moved_payload_exerts_what_its_points_do(seed: int) -> None:
     np.testing.assert_allclose(world.load_wrench(t), expected, atol=1e-6)
     still = World(truth, DH, at(t).q).load_wrench()
     assert np.linalg.norm(expected[:3] - still[:3]) > 1.0, "inertia is no trifle here"
-
-
-def test_a_moved_sensor_pulls_at_the_flange_as_a_point_mass() -> None:
-    truth, _points = point_masses(1)
-    truth = replace(truth, sensor_mass_kg=0.4)
-    at, t = smooth(1), 0.7
-
-    def position(t: float) -> Array:
-        X = forward(DH, at(t).q)
-        return X[:3, :3] @ (truth.p_flange_sensor_m / 2) + X[:3, 3]
-
-    pull = 0.4 * (truth.gravity_m_s2 - second_difference(position, t)) @ forward(DH, at(t).q)[:3, :3]
-    world = World(truth, DH, at(0.0).q)
-    world.move(t, at(t).q, at)
-    moved = world.sensor_load(t)
-    np.testing.assert_allclose(moved, [*pull, *np.cross(truth.p_flange_sensor_m / 2, pull)], atol=1e-6)
-    world.q = at(t).q
-    still = world.sensor_load(t)
-    assert np.linalg.norm(still[:3]) == pytest.approx(0.4 * truth.g_m_s2)
-    assert np.linalg.norm(moved[:3] - still[:3]) > 0.1, "inertia is no trifle here"

@@ -166,16 +166,6 @@ def test_the_readme_describes_every_key() -> None:
     assert rows == [row(key, rule) for key, rule in RULES.items()]
 
 
-@pytest.mark.parametrize(
-    ("text", "meant"),
-    [("[robot]\nhots = 1", "host"), ("[robots]\nhost = 1", "robot"), ("[sensor]\nhight_mm = 1", "height_mm")],
-)
-def test_what_was_meant_is_suggested(text: str, meant: str) -> None:
-    Path("ftdrive.toml").write_text(f"{HEAD}{text}\n")
-    with pytest.raises(ConfigError, match=rf"did you mean {meant}\? the (keys|sections) are "):
-        load()
-
-
 def test_a_password_of_the_store_reaches_no_file() -> None:
     """What runs and recordings keep of the configuration."""
     Path("ftdrive.toml").write_text(GOOD + '[store]\nurl = "postgresql+psycopg://lab:p@ss:w@host:5432/cells"\n')

@@ -6,7 +6,7 @@ import pytest
 
 from ftdrive.cell.config import settings
 from ftdrive.checks import description
-from ftdrive.checks.description import BY_KEY, MODEL, QUESTIONS, ROBOT, TOOL, WALLS, Description, saved_at
+from ftdrive.checks.description import BY_KEY, MODEL, ROBOT, TOOL, WALLS, Description, saved_at
 from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL
 
@@ -41,17 +41,6 @@ def test_a_wall_is_judged_whatever_else_is_wrong(described: Description) -> None
         described.judge(BY_KEY[WALLS], "+x 20")
 
 
-def test_answers_that_exclude_one_another_are_refused_together(described: Description) -> None:
-    described.texts["sensor.height_mm"] = ["120"]
-    for question in QUESTIONS:
-        for text in described.texts.get(question.key, []):
-            described.judge(question, text)
-    with pytest.raises(ConfigError, match="the tool ends 90 mm"):
-        described.judge_rows(BY_KEY[TOOL])
-    with pytest.raises(ConfigError, match="the tool ends 90 mm"):
-        described.cell()
-
-
 def test_the_model_is_asked_for_where_no_robot_reports_it(
     described: Description, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -74,18 +63,6 @@ def test_the_model_is_asked_for_where_no_robot_reports_it(
     assert BY_KEY[MODEL] in described.questions
     assert MODEL not in described.answered
     assert "serial" not in described.found()["robot"]
-
-
-def test_a_draft_keeps_everything(described: Description, tmp_path: Path) -> None:
-    described.answered, described.reports = {ROBOT, TOOL}, {ROBOT: "UR5e, serial 1"}
-    draft = tmp_path / "draft"
-    for _ in range(2):
-        described.save(draft)
-    again = Description(REAL, {})
-    again.load(draft)
-    assert (again.texts, again.answered, again.reports) == (described.texts, described.answered, described.reports)
-    assert ":" in saved_at(draft)
-    assert [*tmp_path.iterdir()] == [draft]
 
 
 def test_a_draft_of_an_emulated_cell_has_no_addresses_for_a_real_one(described: Description, tmp_path: Path) -> None:

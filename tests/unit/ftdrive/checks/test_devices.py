@@ -228,22 +228,6 @@ def test_a_healthy_stream_and_three_that_are_not() -> None:
     assert stream(7, nominal_Hz=np.nan)["sensor.rate"].state == "ok"
 
 
-@pytest.mark.parametrize(
-    ("counted", "state", "words"),
-    [
-        ({"duplicated": 60}, "warning", "of 200, 60 duplicated"),
-        ({"lost": 1, "out_of_order": 1}, "warning", "of 200, 1 out of"),
-        ({"out_of_order": 3}, "failed", "3 out of order"),
-        ({"malformed": 3, "duplicated": 1}, "failed", "of 200, 1 duplicated"),
-    ],
-)
-def test_what_comes_twice_or_too_late_is_reported(counted: dict[str, Any], state: str, words: str) -> None:
-    lost = stream(100, **counted)["sensor.lost"]
-    assert lost.state == state
-    assert words in lost.found
-    assert lost.fix
-
-
 @pytest.mark.parametrize(("rate_Hz", "state"), [(96, "ok"), (109, "ok"), (115, "failed"), (200, "failed")])
 def test_a_rate_that_is_too_high(rate_Hz: float, state: str) -> None:
     rate = stream(rate_Hz)["sensor.rate"]

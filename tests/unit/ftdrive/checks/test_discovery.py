@@ -53,22 +53,6 @@ def test_an_interface_of_the_kernel_is_asked_at_its_own_bit_rate(place: str, bas
     assert places()[0] == "can0"
 
 
-@pytest.mark.parametrize(
-    ("tty", "serial_speed", "query", "bitrate", "base"),
-    [
-        ("/dev/null", "", "bitrate=250000", 250_000, 0x20),
-        ("/dev/null", "@1000000", "bitrate=125000&base=0x7F", 125_000, 0x7F),
-    ],
-)
-def test_an_adapter_on_a_serial_port(
-    tty: str, serial_speed: str, query: str, bitrate: int, base: int, asked: list[Any]
-) -> None:
-    place = f"slcan://{tty}{serial_speed}?{query}"
-    assert is_place(place)
-    assert probe_place(place) == [FOUND, REFUSED]
-    assert asked == [(tty + serial_speed, {"interface": "slcan", "bitrate": bitrate, "base": base, "clock": REAL})]
-
-
 def test_an_adapter_whose_name_is_written_like_in_any_address(asked: list[Any], tmp_path: Path) -> None:
     port = tmp_path / "my port"
     port.symlink_to("/dev/null")
@@ -107,19 +91,6 @@ def test_a_place_that_is_not_written_well(place: str, words: str, asked: list[An
 def test_a_serial_port_is_no_can_interface(place: str, port: str, asked: list[Any]) -> None:
     with pytest.raises(ConnectError, match=rf"is not a CAN interface; .* {port}, .* slcan://{port}\?bitrate=250000$"):
         probe_place(place)
-    assert asked == []
-
-
-def test_an_interface_that_cannot_be_asked(can0: Path, asked: list[Any]) -> None:
-    with pytest.raises(
-        ConnectError, match=r"no CAN interface can1; .*sudo ip link set can1 up type can bitrate 250000$"
-    ):
-        probe_place("can1")
-    with pytest.raises(ConnectError, match=r"500000 bit/s, .*link set can0 down"):
-        probe_place("socketcan://can0?bitrate=250000")
-    (can0 / "flags").write_text("0x40080\n")
-    with pytest.raises(ConnectError, match=r"^can0 is down; .*link set can0 up .* 500000$"):
-        probe_place("can0")
     assert asked == []
 
 

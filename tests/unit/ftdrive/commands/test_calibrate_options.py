@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from ftcalib.errors import BadDataset
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.emulated import REAL_PACE, Station
 from ftdrive.cli import cli
@@ -20,7 +19,6 @@ from ftdrive.runs.run import Run
 from ftdrive.session import session
 from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.session import Calibrating
-from tests.edited_files import edit
 
 CELL = """format = "ftdrive.config/1"
 [robot]
@@ -174,22 +172,6 @@ def test_an_emulated_run_goes_on_in_the_same_cell(cells: list[Any], stations: li
     assert isinstance(call("--resume", str(run.folder), "--robot", "10.0.0.9"), Opened)
     assert stations == []
     assert cells.pop()[1].real
-
-
-@pytest.mark.parametrize(
-    ("wrong", "more"),
-    [({"said": 5}, ()), ({"said": {"tool": "0:60:90"}}, ("--redo", "3")), ({"station": ["can"]}, ("--simulate",))],
-)
-def test_a_run_with_a_field_of_the_wrong_type_is_refused_in_one_sentence(
-    wrong: Mapping[str, Any], more: Sequence[str], begin: Begin, cells: list[Any], stations: list[Any]
-) -> None:
-    Path("ftdrive.toml").write_text(CELL)
-    folder = Path(begin())
-    edit(folder / "run.json", lambda header: header.update(wrong))
-    outcome = CliRunner().invoke(cli, ["calibrate", "--resume", str(folder), *more])
-    assert isinstance(outcome.exception, BadDataset)
-    assert str(outcome.exception).startswith(f"{folder / 'run.json'}: '{next(iter(wrong))}")
-    assert cells == stations == []
 
 
 @pytest.mark.parametrize(("place", "pace"), [(("--at", "tip=0,0,200"), REAL_PACE), (("--gripped",), ())])

@@ -38,26 +38,6 @@ def runs(tmp_path: Path) -> Path:
     return runs
 
 
-def test_the_list_names_results_trends_and_what_to_do(run: Callable[..., Ran], runs: Path) -> None:
-    assert "No results. Add them with `ftdrive calibrate`" in run("history")[2]
-    code, out, err = run("history", "--index", runs)
-    lines = out.splitlines()
-    assert (code, len(lines), err) == (0, 6 + 4 + 2, "")
-    assert lines[0].split()[:4] == ["id", "date", "arm", "tool"]
-    assert "arm-1" in lines[1]
-    assert "gripper-0" in lines[1]
-    assert "2026-03-01" in lines[1]
-    assert "drill" in lines[2]
-    assert "FAILED" in lines[5]
-    assert " d, bias" in lines[5]
-    assert lines[6].startswith("trend: gripper, force bias: +")
-    assert "N per 30 days (1 sigma, 4 results), significant (p =" in lines[6]
-    assert "! gripper: the newest calibration" in out
-    assert "failed its last verification (the force bias has changed by 0.5 N): calibrate again" in out
-    assert run("history")[:2] == run("history", runs)[:2]  # the same from the store and from the folders
-    assert len(run("history", "--tool", "drill")[1].splitlines()) == 3
-
-
 def test_as_json_it_is_one_object(run: Callable[..., Ran], runs: Path) -> None:
     found = json.loads(run("history", "--index", runs, "--json")[1])
     assert found["store"] == str(default_file())

@@ -11,7 +11,6 @@ from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.commands import stream
 from ftdrive.commands.options import CellOptions
 from ftdrive.commands.options import SourceOptions as Chosen
-from ftdrive.errors import ConfigError
 from ftdrive.stream.samples import WrenchFrame
 from tests.unit.ftdrive.stream.simulated import calibrated
 from tests.unit.ftdrive.stream.test_pump import Source
@@ -55,11 +54,3 @@ def test_an_address_that_others_reach_is_said_to_be_unprotected(
     _, printed = run(monkeypatch, tmp_path, "--host", host)
     assert ("There is no password and no encryption" in printed) is not protected
     assert "ws://0.0.0.0" not in printed
-
-
-@pytest.mark.parametrize("udp", ["9870", "host:x", "host:70000"])
-def test_a_wrong_udp_address_is_refused_before_any_work(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, udp: str
-) -> None:
-    with pytest.raises(ConfigError, match=f"--udp is '{udp}': give HOST:PORT, such as"):
-        run(monkeypatch, tmp_path, "--udp", udp)

@@ -204,13 +204,6 @@ def test_a_sensor_known_by_loads_is_decoded_or_its_largest_error_is_named(name: 
         assert 100 * error.max() == pytest.approx(float(stated[1]), rel=0.06)
 
 
-@pytest.mark.parametrize("name", [name for name, one in FORMATS.items() if "bias" not in one.subtracts])
-def test_a_target_without_bias_says_so(name: str) -> None:
-    rng = np.random.default_rng(0)
-    made = export_calibration(arbitrary(rng, FORMATS[name].expresses), name, settings_of(rng))
-    assert any("bias" in note for note in made.notes)
-
-
 @pytest.mark.parametrize(("base_frame", "flange_frame"), FRAMES)
 def test_the_note_turns_the_sensor_of_the_robot_model(base_frame: str, flange_frame: str) -> None:
     rng = np.random.default_rng(2)

@@ -65,12 +65,6 @@ def test_each_mistake_is_one_sentence(folder: Path, text: str, words: str) -> No
         read_cells(written(folder, text))
 
 
-@pytest.mark.parametrize("head", ["", 'format = "ftdrive.cells/2"\n', "format = 1\n"])
-def test_the_format_must_be_known(folder: Path, head: str) -> None:
-    with pytest.raises(ConfigError, match=r'the format is .*: write format = "ftdrive\.cells/1"'):
-        read_cells(written(folder, _CELL, head))
-
-
 def test_cells_whose_runs_cannot_be_separated_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"a and b have the same \[robot\] host host-a.*set arm_serial in each cell"):
         refuse_ambiguous([cell("a"), cell("b", robot_host="host-a")])

@@ -8,7 +8,7 @@ import pytest
 from ftcalib.model import Array
 from ftdrive.fleet.state import FleetFinding
 from ftdrive.store.records import StoredResult
-from tests.unit.ftdrive.fleet.fleet_records import cell, check, daily, fleet, result, weighed
+from tests.unit.ftdrive.fleet.fleet_records import cell, daily, fleet, result, weighed
 from tests.unit.ftdrive.stream.simulated import calibrated
 
 MASS_KG = result("a", 1).mass_kg
@@ -43,10 +43,6 @@ def test_a_centre_of_mass_that_is_wrong_in_several_controllers_is_named() -> Non
     assert "imply other centres, such as (0, 0) mm in b: set the payloads with `ftdrive push`" in one.words
 
 
-def test_one_wrong_controller_is_no_finding_of_the_fleet() -> None:
-    assert found("abc", [payload("a"), payload("b"), payload("c", off_axis_m=np.zeros(2))]) == []
-
-
 @pytest.mark.parametrize(("kg", "wrong"), [(0.5, True), (MASS_KG, False), (MASS_KG + 0.9, False), (5.0, True)])
 def test_a_mass_that_is_wrong_in_several_controllers_is_named(kg: float, wrong: bool) -> None:
     one = found("abc", [payload(name, kg, None) for name in "abc"])
@@ -76,12 +72,6 @@ def test_a_base_that_turned_between_calibrations_is_named() -> None:
     assert "between the calibrations of 2026-09-23 and 2026-11-12" in one.words
 
 
-def test_an_update_that_copies_gravity_hides_no_turned_base() -> None:
-    new = result("a", 10, step=tilted(0.5))
-    results = [result("a", 60), new, result("a", 5, numbers=new.numbers, update="bias", parent=new.id)]
-    assert [one.kind for one in found("a", results)] == ["base"]
-
-
 def test_sensors_that_follow_their_temperature_are_named_by_model() -> None:
     rng = np.random.default_rng(0)
     results = [result(name, 50, sensor_model="Rokubi" if name in "abc" else "Mini45") for name in "abcde"]
@@ -99,28 +89,6 @@ def test_sensors_that_follow_their_temperature_are_named_by_model() -> None:
 
 def check_at(one: Any, T: float) -> Any:
     return one._replace(temperature_C=float(T))
-
-
-def test_a_drift_in_a_warming_season_is_no_dependence_on_temperature() -> None:
-    results = [result(name, 60) for name in "abc"]
-    days = np.arange(60)
-    added = np.outer(days / 7, np.ones(6))
-    checks = [
-        check_at(each, T)
-        for seed, one in enumerate(results)
-        for each, T in zip(daily(one, 60, seed, added), 20 + days / 10, strict=True)
-    ]
-    assert [one.kind for one in found("abc", results, checks)] == []
-
-
-def test_late_verifications_are_one_finding() -> None:
-    results = [result("a", 30), result("b", 20), result("c", 7.5), result("d", 2)]
-    names = [cell(name) for name in "abcde"]  # e was never calibrated; c is due since half a day
-    (one,) = fleet(names, results, [check(results[1], 19)]).findings
-    assert (one.kind, one.cells) == ("overdue", ("a", "b"))
-    assert one.words == "The verifications of a and b are late, that of a by 23 d: run `ftdrive fleet verify --due`"
-    (alone,) = fleet([cell("a")], results).findings
-    assert alone.words.startswith("The verification of a is 23 d late")
 
 
 @pytest.mark.parametrize(

@@ -90,24 +90,6 @@ def test_every_field_of_a_cell_is_a_metric_and_what_is_unknown_is_absent(server:
     }
 
 
-def test_weighings_are_a_mass_a_time_and_counters(server: MetricsServer) -> None:
-    at = NOW - timedelta(hours=1)
-    some = weighed("A", 0, weighings=40, refusals={"cable": 3, "contact": 1}, last_utc=at.isoformat())
-    none = weighed("A", 0, weighings=0, refusals={"cable": 5}, last_utc=None, mass_kg=None, mass_sigma_kg=None)
-    server.update(*reading(cell("A", weighings=some), cell("B", weighings=none), cell("C")))
-    found = samples(server)
-    assert {name: value for name, value in found.items() if name[0].startswith("ftdrive_weighing_")} == {
-        ("ftdrive_weighing_mass_kilograms", "A"): 0.25,
-        ("ftdrive_weighing_sigma_kilograms", "A"): 1e-3,
-        ("ftdrive_weighing_timestamp_seconds", "A"): at.timestamp(),
-    }
-    assert {cell: value for (name, cell), value in found.items() if name == "ftdrive_weighings_total"} == {
-        "A": 40,
-        "B": 0,
-    }
-    assert 'ftdrive_weighings_refused_total{cell="A",code="contact",tool="gripper"} 1.0' in scraped(server)
-
-
 def test_a_cell_that_disappears_disappears(server: MetricsServer) -> None:
     assert samples(server) == {}
     server.update(*reading(cell("A"), cell("B")))

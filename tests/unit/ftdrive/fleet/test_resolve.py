@@ -13,7 +13,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.fleet.resolve import Comparison, is_calibration, solve_again, solve_run, solved_path
 from ftdrive.fleet.workers import Workers
 from ftdrive.runs import run_folders
-from tests.calibrated_runs import FIRST, calibrated_run, dataset, swept_run
+from tests.calibrated_runs import FIRST, calibrated_run, swept_run
 
 
 def at_once(function: Callable[..., bytes], *arguments: Any) -> "Future[bytes]":
@@ -53,27 +53,6 @@ def test_a_run_in_motion_is_solved_here_and_from_its_files_to_the_same_bytes(tmp
     assert solved_path(folder).read_bytes() == (folder / "calibration.json").read_bytes()
     assert new.provenance["created_utc"] == FIRST.isoformat()
     assert [new.provenance[name] for name in ("run", "recording")] == ["swept", "motion.npz"]
-
-
-def test_a_run_that_has_the_result_is_not_solved_again(tmp_path: Path) -> None:
-    folder = calibrated_run(tmp_path, "run")
-    again(folder)
-    first = solved_path(folder).stat()
-
-    def never(*_: Any) -> "Future[bytes]":
-        raise AssertionError("solved twice")
-
-    assert again(folder, submit=never) == {folder: Comparison("good", "good", None, "R_flange_sensor.x", 0.0)}
-    assert solved_path(folder).stat() == first
-
-
-def test_a_run_without_a_result_of_its_newest_poses_has_another_verdict(tmp_path: Path) -> None:
-    folder = calibrated_run(tmp_path, "run")
-    dataset(2).save(folder / "dataset-2.json")  # more poses were taken, and the solve of all was rejected
-    found = again(folder)[folder]
-    assert isinstance(found, Comparison)
-    assert (found.verdict_before, found.has_changed, found.has_other_verdict) == (None, False, True)
-    assert CalibrationResult.load(solved_path(folder)).provenance["dataset_sha256"] == dataset(2).sha256()
 
 
 def test_a_failure_has_its_reason_and_concerns_one_run(tmp_path: Path) -> None:

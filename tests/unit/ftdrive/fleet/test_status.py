@@ -5,8 +5,6 @@ from datetime import timedelta
 import numpy as np
 
 from ftdrive.fleet.state import times_in_words
-from ftdrive.fleet.status import fleet_state
-from ftdrive.store.store import Store
 from tests.unit.ftdrive.fleet.fleet_records import NOW, cell, check, daily, fleet, result, time, weighed
 
 
@@ -69,13 +67,6 @@ def test_due_counts_from_the_last_verification_whatever_its_outcome() -> None:
     assert (one.due, one.is_due(NOW), one.temperature_C) == (NOW + timedelta(days=6), False, 31.0)
 
 
-def test_a_verification_before_the_last_90_days_is_found_too() -> None:
-    made = result("a", 300)
-    (one,) = fleet([cell("a", verify_every_days=180.0)], [made], [check(made, 200)]).cells
-    assert (one.verified, one.drift) == (NOW - timedelta(days=200), None)
-    assert one.due == NOW - timedelta(days=20)
-
-
 def ramp(a_week: float, since_days_ago: float, days: int = 60) -> np.ndarray:
     added = np.zeros((days, 6))
     added[:, 0] = a_week / 7 * np.maximum(0.0, since_days_ago - np.arange(days)[::-1])
@@ -96,20 +87,6 @@ def test_a_drift_is_found_and_put_in_words() -> None:
     assert 4 < a.level_sigmas < 7
     assert (b.found, b.words) == (False, "")
     assert b.level_sigmas < 2
-
-
-def test_a_store_gives_the_same_state_as_its_records(store_url: str) -> None:
-    made, other = result("a", 61), result("b", 200, tool=None, payload_kg=1.9, payload_com_m=[0.0, 0.0, 0.05])
-    more = [result("b", 210 + days, tool=None) for days in range(5)] + [result("b", 5, verdict="rejected")]
-    more += [result("b", 1, created_utc=None), result("b", 30, tool="drill"), result("b", 31, arm_serial=None)]
-    checks = [*daily(made, 60, 1, ramp(2.0, 21), temperature_C=25.0), check(other, 150, passed=False)]
-    cells = [cell("b"), cell("a"), cell("c", arm_serial="arm-c")]
-    store = Store(store_url)
-    store.put_cells(cells)
-    with store._database.writing() as connection:
-        store._write(connection, [made, other, *more, *checks])
-    assert fleet_state(store, NOW) == fleet(cells, [made, other, *more], checks)
-    assert [one.id for one in store.fleet(2, NOW)[1] if one.tool is None] == ["b-210", "b-200"]
 
 
 def test_the_last_weighing_is_that_of_the_same_cell_tool_and_kind_of_cell() -> None:

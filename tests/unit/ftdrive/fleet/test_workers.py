@@ -1,18 +1,16 @@
 """Calls on workers that may die; here the workers are threads, or futures that are done at once."""
 
 from collections import Counter
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ftcalib.errors import BadDataset
 from ftdrive.errors import ConfigError
 from ftdrive.fleet import workers
 from ftdrive.fleet.workers import (
     SAME,
-    Call,
     WorkerDied,
     Workers,
     _require_same_versions,
@@ -58,26 +56,6 @@ def test_a_call_that_no_worker_is_left_for_ends(monkeypatch: pytest.MonkeyPatch)
     endless = Workers(1, lambda *_: Future[bytes](), BrokenExecutor, require_one=require_one)
     with pytest.raises(StreamBroken, match="no worker left"):
         list(answers(lambda item: (name_of, item), ITEMS, endless))
-
-
-def test_an_error_concerns_one_item() -> None:
-    first, second, impossible, *rest = ITEMS
-
-    def call_of(item: Path) -> Call:
-        if item in {first, second}:
-            raise BadDataset("damaged")
-        return called, item
-
-    def called(item: Path) -> bytes:
-        if item == impossible:
-            raise ZeroDivisionError
-        return name_of(item)
-
-    with ThreadPoolExecutor(1) as threads:
-        found = dict(answers(call_of, ITEMS, Workers(1, threads.submit, BrokenExecutor)))
-    kinds = [type(found.pop(one)) for one in (first, second, impossible)]
-    assert kinds == [BadDataset, BadDataset, ZeroDivisionError]
-    assert found == {item: name_of(item) for item in rest}
 
 
 @pytest.mark.parametrize("address", ["tcp://host:8786", "dask://host", "dask://:8786", "dask://a@b:1", "host:8786"])

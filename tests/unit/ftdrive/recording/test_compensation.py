@@ -226,20 +226,3 @@ def test_late_samples_of_another_program_are_no_gaps_and_missing_ones_are(name: 
     off = np.abs(numbers - np.delete(np.arange(len(t_s)), lost)).max()
     assert off <= {"batches": 2, "pauses": 1}.get(name, 0)  # there the place of a gap is not seen to the sample
     assert abs(numbers[-1] - (len(t_s) - 1)) <= 1
-
-
-def test_the_log_of_a_real_sensor_has_one_gap(real_data: Path) -> None:
-    t_s = np.loadtxt(real_data / "ur5e_pick_stream" / "wrench.csv", delimiter=",", usecols=0)
-    numbers = sample_numbers(t_s)
-    assert np.count_nonzero(np.diff(numbers) != 1) == 1
-    assert numbers[-1] == round(500 * (t_s[-1] - t_s[0])) == len(t_s)  # the sensor of a UR5e has 500 Hz
-
-
-def test_a_pause_of_another_program_is_a_gap(tmp_path: Path) -> None:
-    t_s = np.delete(np.arange(100) / 100, [40, 41])
-    table = np.c_[t_s, np.tile(np.arange(6.0), (98, 1))]
-    np.savetxt(tmp_path / "w", table, delimiter=",", header="t,fx,fy,fz,tx,ty,tz", comments="")
-    (tmp_path / "p").write_text("t,rx,ry,rz\n0,0,0,0\n1,0,0,0\n")
-    ((samples, _, share),) = TablePair(Table(tmp_path / "w"), Table(tmp_path / "p"), calibration(), "c", 0.0).blocks()
-    assert np.count_nonzero(np.diff(samples.seq) != 1) == 1
-    assert (samples.seq[-1], share) == (99, 1.0)

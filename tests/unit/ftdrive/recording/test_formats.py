@@ -253,20 +253,6 @@ def test_a_flipped_bit_is_refused_or_changes_no_number(small: Sequence[Path], en
     assert rejected > 13
 
 
-def test_each_block_of_a_csv_file_has_its_checksum(small: Sequence[Path], tmp_path: Path) -> None:
-    lines = small[ENDINGS.index(".csv")].read_text(encoding="utf-8").splitlines(keepends=True)
-    path = tmp_path / "a.csv"
-    ends = [number for number, line in enumerate(lines) if line.startswith("# crc32 ")]
-    assert len(ends) > 10
-    path.write_text("".join(lines[: ends[3] + 4]), encoding="utf-8")  # three samples without a checksum
-    assert len(load_recording(path).rows) == ends[3] - 3 - 3
-    changed = lines.copy()
-    changed[ends[2] - 1] = changed[ends[2] - 1].replace("0.", "1.", 1)
-    path.write_text("".join(changed), encoding="utf-8")
-    with pytest.raises(BadRecording, match=f"line {ends[2] + 1} is not the checksum"):
-        load_recording(path)
-
-
 def test_a_csv_file_without_an_end_of_a_line_or_a_checksum_is_refused(
     small: Sequence[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

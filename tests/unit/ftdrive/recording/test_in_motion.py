@@ -68,13 +68,6 @@ def files(tmp_path: Path, swept: Recorded) -> tuple[object, ...]:
     return "--wrench", wrench, "--orientation-file", poses
 
 
-def test_files_of_another_program_are_solved(files: tuple[object, ...]) -> None:
-    document = run(*files, "--up", "0,0,1")
-    assert document["verdict"] == "good"
-    assert document["mass_kg"] == pytest.approx(TRUTH.mass_kg, abs=1e-3)
-    assert document["sigma"]["inertia_kg_m2"][0][0] > 0
-
-
 @pytest.mark.slow
 def test_files_of_another_program_are_joined_with_an_earlier_result(tmp_path: Path, files: tuple[object, ...]) -> None:
     earlier = calibrated_from({**TRUTH.to_dict(), "noise_force_N": 0.05, "noise_torque_Nm": 0.002})

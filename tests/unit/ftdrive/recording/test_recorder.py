@@ -81,35 +81,6 @@ def test_a_full_disk_leaves_partial_files_that_say_what_is_safe(
     assert list(recorder.partial) == [partial_of(first), tmp_path / "b.csv.partial"]
 
 
-@pytest.mark.parametrize("ending", [".mcap", ".csv"])
-def test_without_room_for_the_end_the_partial_file_is_readable(
-    ending: str, tmp_path: Path, fill_disk: Callable[[int], None]
-) -> None:
-    path = tmp_path / f"a{ending}"
-    whole = Recorder([tmp_path / f"b{ending}"], info(), {})
-    whole.add(block(1100), [])
-    size = (tmp_path / f"b{ending}.partial").stat().st_size
-    whole.end()
-    fill_disk(size)
-    recorder = Recorder([path], info(), {})
-    recorder.add(block(1100), [])
-    with pytest.raises(OSError, match=r"No space left .*\.partial contains 1100 samples"):
-        recorder.end()
-    assert not path.exists()
-    partial = tmp_path / f"a{ending}.partial"
-    found = load_recording(partial)
-    assert len(found.rows) == 1100
-    assert found.cut
-    with pytest.raises(OSError, match="No space left"):
-        write_recording(tmp_path / f"c{ending}", found)
-    assert not list(tmp_path.glob("c*"))
-    fill_disk(10**9)
-    write_recording(tmp_path / f"c{ending}", found)
-    assert load_recording(tmp_path / f"c{ending}").rows.tobytes() == found.rows.tobytes()
-    with pytest.raises(FileExistsError, match=r"ftdrive convert .*partial"):
-        Recorder([path], info(), {})
-
-
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_control_c_amid_a_write_waits_for_its_end(ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without, the files of one recording would hold different samples, or half a line."""
@@ -190,23 +161,6 @@ def test_without_a_sample_there_is_no_file(tmp_path: Path) -> None:
     recorder.add(None, [StreamEvent(0, "mark", "x")])
     recorder.end()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_error_of_one_file_completes_the_others(tmp_path: Path) -> None:
-    recorder = Recorder([tmp_path / "a.csv", tmp_path / "b.csv"], info(), {})
-    recorder.add(block(3), [])
-    (tmp_path / "a.csv").touch()
-    with pytest.raises(FileExistsError, match=r"a\.csv\.partial contains 3 samples"):
-        recorder.end()
-    assert recorder.saved == [tmp_path / "b.csv"]
-    assert len(load_recording(tmp_path / "b.csv").rows) == 3
-
-
-def test_an_unknown_ending_is_refused_before_any_work(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"name it \.mcap, \.csv or \.parquet"):
-        Recorder([tmp_path / "a.bag"], info(), {})
-    with pytest.raises(ConfigError, match="two outputs name the same file"):
-        Recorder([tmp_path / "a.parquet", tmp_path / "a.parquet.mcap"], info(), {})
 
 
 @pytest.mark.parametrize(("missing", "ending"), [("mcap", ".mcap"), ("pyarrow", ".parquet")])

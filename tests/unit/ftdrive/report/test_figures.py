@@ -7,10 +7,9 @@ import matplotlib.figure
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex, to_rgba
 
-from ftcalib.model import PARAMETER_NAMES, Array
-from ftdrive.report.figures import MOST_DOTS, SERIES, WIDTH_IN, draw_figure
+from ftcalib.model import Array
+from ftdrive.report.figures import WIDTH_IN, draw_figure
 from ftdrivers.sweep import Sweep
 
 Draw = Callable[[str, Mapping[str, Any]], Any]
@@ -63,13 +62,6 @@ def levels(axes: Any) -> list[float]:
     return [float(line.get_ydata()[0]) for line in axes.lines if len(line.get_xdata()) == 2]
 
 
-def test_of_many_poses_every_so_many_is_named(drawn: Draw) -> None:
-    for n, step in ((25, 2), (73, 4)):
-        (axes,) = drawn("pose_residuals", {"poses": [pose(row) for row in range(1, n + 1)]}).axes
-        assert names_at(axes) == [f"R{100 + row}" for row in range(1, n + 1, step)]
-        assert axes.get_xticks().tolist() == list(range(0, n, step))
-
-
 @pytest.mark.parametrize(
     ("apart_s", "motion", "x", "words"),
     [
@@ -115,56 +107,6 @@ def test_the_sigma_of_a_contact_is_drawn_with_and_without_loads(drawn: Draw) -> 
     assert axes.get_ylim()[0] == 0
 
 
-def test_a_changed_parameter_reaches_beyond_the_limits(drawn: Draw) -> None:
-    for largest, ticks in ((-8.0, [-3, 0, 3]), (40.0, [-30, -3, 0, 3, 30]), (4000.0, [-3000, -30, -3, 0, 3, 30, 3000])):
-        sigmas = [largest, None, *[0.5] * 13]
-        found = [{"name": name, "sigmas": one} for name, one in zip(PARAMETER_NAMES, sigmas, strict=True)]
-        (axes,) = drawn("comparison", {"comparison": {"parameters": found}}).axes
-        assert [bar.get_width() for bar in axes.patches] == [largest, 0.0, *[0.5] * 13]
-        assert [float(line.get_xdata()[0]) for line in axes.lines] == [0, -3, 3]
-        assert axes.get_xlim() == pytest.approx((-max(10, 1.2 * abs(largest)), max(10, 1.2 * abs(largest))))
-        assert set(ticks) <= {round(float(tick)) for tick in axes.get_xticks()}
-        assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the first parameter on top
-        assert axes.get_yticklabels()[3].get_text() == "weight x"
-
-
-def test_methods_are_bars_within_whole_decades(drawn: Draw) -> None:
-    def method(name: str, force_N: float | None, torque_Nm: float = 0.0) -> dict[str, Any]:
-        return {"method": name, "cross_validated": {"force_rms_N": force_N, "torque_rms_Nm": torque_Nm}}
-
-    methods = [method("lrom", 0.8, 0.05), method("ml", 0.12, 0.003), method("one", None), {"method": "x", "reason": ""}]
-    figure = drawn("methods", {"cross_validation": {"methods": methods}, "result": {"method": "ml"}})
-    assert figure.get_figheight() == 2.0
-    for axes, values, limits, unit in zip(
-        figure.axes, ([0.8, 0.12], [50, 3]), ((0.01, 1), (1, 100)), ("N rms", "mN·m rms"), strict=True
-    ):
-        assert [bar.get_width() for bar in axes.patches] == pytest.approx(values)
-        assert [to_hex(bar.get_facecolor()) for bar in axes.patches] == [SERIES[0], SERIES[1]]
-        assert axes.get_xlim() == pytest.approx(limits)
-        assert (axes.get_xscale(), axes.get_xlabel()) == ("log", unit)
-
-
-def test_a_correlation_is_the_strength_of_its_field(drawn: Draw) -> None:
-    matrix = np.eye(15)
-    matrix[2, 7] = matrix[7, 2] = -0.6
-    matrix[0, 1] = matrix[1, 0] = 0.019
-    (axes,) = drawn("correlation", {"correlation": {"names": PARAMETER_NAMES, "matrix": matrix.tolist()}}).axes
-    fields = axes.collections[0]
-    corners = {tuple(path.vertices.min(axis=0)): tuple(path.vertices.max(axis=0)) for path in fields.get_paths()}
-    assert corners == {(x, y): (x + 1, y + 1) for x, y in [*((k, k) for k in range(15)), (7, 2), (2, 7)]}
-    strength = dict(
-        zip(
-            map(tuple, (path.vertices.min(axis=0) for path in fields.get_paths())), fields.get_facecolors(), strict=True
-        )
-    )
-    assert tuple(strength[7, 2]) == to_rgba(SERIES[0], 0.6)
-    assert axes.get_yticks().tolist() == axes.get_xticks().tolist() == [k + 0.5 for k in range(15)]
-    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 15), (15, 0))
-    edges = {float(line.get_ydata()[0]) for line in axes.lines if np.ptp(line.get_ydata()) == 0}
-    assert edges == {0, 3, 6, 9, 12, 15}  # around the five vectors
-    assert names_at(axes)[9] == axes.get_yticklabels()[9].get_text() == "centre of mass x"
-
-
 def test_a_sweep_is_drawn_from_rest_to_rest(drawn: Draw) -> None:
     sweep = Sweep(
         [0, -1, 1, 0.1, 0.2, 0.3], [[1, 0.5], [0.8, 0.2], [0.3, 0.3]], [[1, 2], [1, 3], [2, 1]], [[0, 1]] * 3, 20.0, 3.0
@@ -195,13 +137,6 @@ def dots_of(axes: Any) -> list[Array]:
     return [
         directions(*one.get_offsets().T) for one in axes.collections if len(one.get_offsets()) and one.get_zorder() == 3
     ]
-
-
-def test_of_many_dots_every_so_many_is_drawn(drawn: Draw) -> None:
-    for n, shown in ((MOST_DOTS, MOST_DOTS), (MOST_DOTS + 1, MOST_DOTS // 2 + 1)):
-        seen = np.tile([0.0, 0.0, 1.0], (n, 1))
-        found = {"gravity_in_flange": seen, "gap_towards": [0, 0, -1], "largest_gap_rad": 1.0}
-        assert [len(dots) for dots in dots_of(drawn("coverage", {"coverage": found}).axes[0])] == [shown]
 
 
 @pytest.mark.parametrize(("name", "key", "words", "coverage"), [

@@ -29,7 +29,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.report.facts import comparison_facts, contact_error, facts_of
 from ftdrive.report.figures import VARIABLES
 from ftdrive.report.page import render_page as written
-from ftdrive.report.sections import comparison, contact, coverage, cross_validation, sections_of, shown_poses
+from ftdrive.report.sections import comparison, contact, coverage, cross_validation, sections_of
 from ftdrive.report.subject import Subject, read_subject
 from ftdrive.runs.run import Reading, Run
 from ftdrive.runs.source import SolveOptions
@@ -238,14 +238,6 @@ def test_a_moved_centre_of_mass_is_the_only_group_that_changed() -> None:
     assert found["parameters"][9]["sigmas"] == pytest.approx(8)
     assert not found["same_data"]
     assert comparison_facts(before, before)["same_data"]
-
-
-def test_the_worst_of_many_poses_are_shown() -> None:
-    poses: list[dict[str, Any]] = [{"row": k, "sigmas": 9.0 if k % 97 == 0 else 1.0} for k in range(1000)]
-    rows = [pose["row"] for pose in shown_poses(poses)]
-    assert set(range(0, 1000, 97)) <= set(rows)
-    assert len(rows) <= 200
-    assert rows == sorted(rows)
 
 
 CONFIG = {

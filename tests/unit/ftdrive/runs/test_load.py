@@ -1,7 +1,5 @@
 """A weighed load as options describe it, as a run keeps it, and what its result must not be taken for."""
 
-import json
-
 import pytest
 
 from ftcalib.errors import BadCalibration
@@ -31,11 +29,6 @@ def test_options_describe_one_place() -> None:
     for place, gripped in ((None, False), ("tip=0,0,200", True), ("tip", False)):
         with pytest.raises(ConfigError, match="--at"):
             Load.of("2", place, gripped=gripped)
-
-
-@pytest.mark.parametrize("load", [Load.of("2", "tip=0,0,200", gripped=False), Load.of("2", None, gripped=True)])
-def test_a_header_keeps_a_load(load: Load) -> None:
-    assert Load.of_header({"load": json.loads(json.dumps(load.to_dict()))}) == load
 
 
 def test_a_run_with_a_load_is_not_that_of_its_tool(lab: Lab) -> None:

@@ -135,15 +135,6 @@ def test_a_pose_is_checked_to_its_last_bit(run: Run) -> None:
     assert all("01.npz" in words for words in refused)
 
 
-def test_a_pose_that_seems_to_have_a_password_is_named(run: Run) -> None:
-    path = run.folder / "poses" / "01.npz"
-    content = bytearray(path.read_bytes())
-    content[content.index(b"PK\1\2") + 8] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(BadDataset, match=r"01\.npz .*password.*--resume"):
-        run.records()
-
-
 def test_an_array_that_cannot_be_parsed_is_named(run: Run) -> None:
     path = run.folder / "poses" / "01.npz"
     header = b"{'descr': '<f8', 'fortran_order': (".ljust(118) + b"\n"

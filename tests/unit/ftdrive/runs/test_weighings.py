@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from ftcalib import files
 from ftcalib.errors import BadDataset
 from ftdrive.runs.weighings import FORMAT, REFUSALS, WeighingDay, append_weighings
 from ftdrive.stream.weighing import WORDS
@@ -70,16 +69,6 @@ def test_damage_is_refused(tmp_path: Path) -> None:
         path.write_text(damaged)
         with pytest.raises(BadDataset, match=words):
             WeighingDay.load(path)
-
-
-def test_a_line_without_an_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = append(tmp_path, part(0.1))
-    before = WeighingDay.load(path)
-    with path.open("ab") as end:
-        end.write(bytes(5000))
-    monkeypatch.setattr(files, "_LONGEST_LINE", 4000)
-    with pytest.raises(BadDataset, match="line 3 is longer than"):
-        WeighingDay.load(path, before)
 
 
 def test_a_failed_write_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

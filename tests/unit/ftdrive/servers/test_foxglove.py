@@ -1,7 +1,6 @@
 """A plain WebSocket client reads what the server sends, and decodes it with other implementations."""
 
 import importlib
-import json
 import re
 import sys
 from collections.abc import Iterator
@@ -103,22 +102,6 @@ def test_frames_lead_from_base_to_the_frame_of_the_wrench(server: FoxgloveServer
     for name, (R, p) in expected.items():
         assert np.allclose(poses[name][0], R), name
         assert np.allclose(poses[name][1], p), name
-
-
-def test_the_status_says_what_is_shown_and_is_valid_json(server: FoxgloveServer, client: Client) -> None:
-    client.subscribe(STATUS)
-    server.add(block(), [])
-
-    def refuse(word: str) -> None:
-        raise AssertionError(word)
-
-    status = json.loads(client.message()[2], parse_constant=refuse)
-    assert status["frame"] == "sensor axes, about the sensor origin"
-    assert status["stages"]["lowpass_Hz"] is None
-    assert status["calibration"] == "calibration.json"
-    assert status["marks"] == ["EMULATED"]
-    assert status["status"]["arm"]["lost"] == 3
-    assert status["status"]["drift_N_h"] is None  # NaN there
 
 
 def test_parameters_are_the_frame_and_the_stages(stream: FakeStream, client: Client) -> None:

@@ -2,7 +2,6 @@
 
 from array import array
 from collections.abc import Callable
-from dataclasses import asdict
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +9,7 @@ import pytest
 
 from ftdrive.errors import ConfigError
 from ftdrive.servers import parameters as of_ros2
-from ftdrive.servers.parameters import Fixed, NodeParameters, checked_value
+from ftdrive.servers.parameters import NodeParameters, checked_value
 from ftdrive.stream.samples import Stages, WrenchFrame
 
 FRAME = WrenchFrame("base", "tcp")
@@ -57,21 +56,6 @@ class FakeNode:
 def _no_ros2(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = SimpleNamespace(ParameterDescriptor=SimpleNamespace, SetParametersResult=SimpleNamespace)
     monkeypatch.setattr(of_ros2, "ros2_module", lambda _: fake)
-
-
-def test_a_node_declares_what_it_has_and_what_cannot_change() -> None:
-    node = FakeNode(about=(0.0, 0.0, 0.2), rate=100, lowpass_Hz=20.0, publish_base_tf=True, sensor_frame="wrist/ft")
-    found = NodeParameters(node, FRAME, "gripper")
-    assert (found.frame, found.stages) == (WrenchFrame("base", (0.0, 0.0, 0.2)), Stages(lowpass_Hz=20.0))
-    assert found.tool == "gripper"
-    assert (found.fixed.rate, found.fixed.sensor_frame, found.fixed.base_frame) == (100, "wrist/ft", "base")
-    assert found.fixed.publish_base_tf
-    fixed = {"rate", "reliable", "base_frame", "flange_frame", "sensor_frame", "publish_base_tf"}
-    assert {name for name, one in node.declared.items() if one.read_only} == fixed
-    assert all(one.description and one.dynamic_typing for one in node.declared.values())
-    assert node.declared.keys() == {"axes", "about", "tool", *fixed, *asdict(Stages())}
-    assert NodeParameters(FakeNode(), FRAME, "").fixed == Fixed(500.0, False, "base", "tool0", "ft_sensor", False)
-    assert [NodeParameters(FakeNode(rate=rate), FRAME, "").fixed.rate for rate in (1, 2000)] == [1, 2000]
 
 
 @pytest.mark.parametrize(

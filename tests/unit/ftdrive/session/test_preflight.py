@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from ftdrive.cell.config import ToolConfig
-from ftdrive.checks import computer
 from ftdrive.checks.check import Check
 from ftdrive.errors import NotAccepted
 from ftdrive.session import preflight
@@ -146,14 +145,6 @@ def test_another_arm_than_the_one_that_is_meant_is_refused(lab: Lab) -> None:
     assert lab.take_poses(dry_run=True) is None
     lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="B2"))
     refuse(lab, r"the arm at fake has serial A1, but \[robot\] serial is B2")
-
-
-def test_a_folder_that_cannot_be_written_is_refused(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(**_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(computer, "TemporaryFile", full)
-    refuse(lab, "No space left")
 
 
 def test_a_plan_for_another_tool_is_refused(lab: Lab) -> None:

@@ -65,15 +65,6 @@ def test_tools_sensors_and_mounts_are_not_mixed(tmp_path: Path) -> None:
     assert drifts(results) == []
 
 
-@pytest.mark.parametrize(("days", "n"), [((0, 1, 2.9), 0), ((0, 3), 0), ((0, 1, 3), 4)])
-def test_less_than_three_results_over_three_days_is_no_trend(days: tuple[float, ...], n: int, tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    for day in days:
-        step = rng.multivariate_normal(np.zeros(15), calibrated().covariance)
-        new_run(tmp_path, f"{day}", result(day, step))
-    assert len(drifts(records(tmp_path)[0])) == n
-
-
 def test_a_copied_or_known_value_is_no_point_of_a_trend(tmp_path: Path) -> None:
     """Updates of the bias keep mass and centre of mass: only three results have estimated these."""
     results = months(tmp_path, np.zeros(15), 5)

@@ -12,7 +12,7 @@ import pytest
 from ftdrive.runs.weighings import append_weighings
 from ftdrive.store.store import Store
 from ftdrive.store.weighing_log import WeighingLog
-from tests.unit.ftdrive.store.contents import connected, dump
+from tests.unit.ftdrive.store.contents import connected
 
 ORIGIN = {
     "tool": "gripper",
@@ -73,21 +73,6 @@ def test_the_last_weighing_and_the_counts_of_its_day_come_back(logs: Logs) -> No
 def test_a_day_ends_at_midnight(logs: Logs) -> None:
     logs.write(0.1, 0.2, 0.3, times=iter(NOON + timedelta(hours=6 * n) for n in range(3)))
     assert [(one.day, one.weighings) for one in Store(logs.url).weighings(9)] == [("2026-11-26", 2), ("2026-11-27", 1)]
-
-
-def test_rebuilt_it_is_the_same_and_a_deleted_day_is_forgotten(logs: Logs) -> None:
-    logs.write(0.1, "cable", 0.2)
-    logs.write(0.3, times=iter([NOON + timedelta(days=1)]))
-    store, grown = Store(logs.url), dump(logs.url)
-    assert store.rebuild().weighings == 2
-    assert dump(logs.url) == grown
-    assert store.index(logs.folder).weighings == 0
-    append_weighings(logs.folder, ORIGIN, "2026-11-26", [part(0.4)])
-    assert store.index(logs.folder).weighings == 1, "it has grown"
-    assert store.weighings(9)[0].weighings == 3
-    next(logs.folder.glob("weighings-2026-11-26-*")).unlink()
-    store.rebuild()
-    assert [one.day for one in store.weighings(9)] == ["2026-11-27"]
 
 
 def test_an_index_without_weighings_is_replaced(logs: Logs) -> None:

@@ -61,39 +61,3 @@ def test_the_limit_is_that_of_an_estimated_covariance() -> None:
     for rate in (0.1, 0.02):
         assert (squared > limit_of(rate, dof)).mean() == pytest.approx(rate, rel=0.1)
     assert limit_of(0.01, 6.0) == float("inf") > limit_of(0.01, 6.1)
-
-
-@pytest.mark.parametrize("state", [0, 2])
-@pytest.mark.parametrize("inertia", Inertia)
-def test_the_distance_has_all_that_is_not_known_in_its_covariance(state: int, inertia: Inertia) -> None:
-    test = ContactTest(RATE_HZ, 1e-4, BEYOND, FRICTION_AXIS)
-    residual = RNG.standard_normal((2 * SIZE, 6)) * np.repeat([0.2, 0.01], 3)
-    predicted = np.outer(np.arange(2 * SIZE), [0.02, 0.01, -0.03, 1e-3, 2e-3, -1e-3])
-    felt = np.array([0.1, 0.2, 0.0, 0.003, 0.002, 0.0])
-    readings, chi2, beyond = judged(test, residual, predicted, state, felt, inertia)
-    reading = residual[SIZE:].mean(axis=0)
-    np.testing.assert_allclose(readings[-1], reading, atol=1e-12)
-    calibration = calibrated()
-    uncertainty = calibration.wrench_covariance(R)
-    covariance = uncertainty + np.diag(BEYOND) + NOISE.reading + NOISE.wander
-    if state:
-        tool_kg_m2 = MASS_KG * 0.08**2
-        acceleration_m_s2 = {Inertia.UNKNOWN: 1.0, Inertia.COARSE: 0.3, Inertia.EXACT: 0.0}[inertia]
-        for axis in np.eye(3):
-            force_N = MASS_KG * acceleration_m_s2 * axis
-            pull = np.r_[force_N, np.cross(calibration.parameters.p_sensor_com_m, force_N)]
-            covariance += np.outer(pull, pull)
-            turn = np.r_[np.zeros(3), tool_kg_m2 * 2.5 * axis]
-            covariance += np.outer(turn, turn)
-        friction = 0.15 * np.r_[np.zeros(3), FRICTION_AXIS]
-        covariance += np.outer(friction, friction)
-        change = predicted[-1] - predicted[-1 - SIZE]
-        inexact = change * np.hypot(0.003, 0.005) / 0.02
-    else:
-        inexact = felt
-    covariance += np.outer(inexact, inexact)
-    assert chi2[-1] == pytest.approx((reading - OFFSET) @ np.linalg.solve(covariance, reading - OFFSET))
-    np.testing.assert_array_equal(beyond, chi2 > test.limit)
-    np.testing.assert_allclose(test.uncertainty, uncertainty + np.diag(BEYOND))
-    restarted = judged(test, np.zeros((0, 6)), np.zeros((0, 6)), state, felt, inertia)
-    assert [len(one) for one in restarted] == [0, 0, 0]

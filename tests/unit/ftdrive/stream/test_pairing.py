@@ -3,17 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from ftcalib.errors import BadDataset
 from ftcalib.model import angle_between
 from ftcalib.motion.samples import RATE_TOLERANCE, SampleClock
-from ftdrive.stream.pairing import DelayEstimator, Pairing, PoseTrack, pair_blocks
+from ftdrive.stream.pairing import Pairing, PoseTrack
 from ftdrivers.interfaces import ArmStates, FtSamples
-from tests.unit.ftdrive.stream.simulated import P_FLANGE_SENSOR_M, T0_NS, Motion, calibrated
+from tests.unit.ftdrive.stream.simulated import T0_NS, Motion
 
 
 def received(seconds: float, rate_Hz: float, batch: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -103,19 +101,6 @@ def recording(delay_s: float, scale: float = 1.0) -> tuple[FtSamples, ArmStates]
 
 PUSHED = np.zeros((6000, 6))
 PUSHED[1500:2500, :3] = np.array([5.0, -8.0, 3.0]) * np.sin(np.arange(1000) * 0.02)[:, None]
-
-
-def test_an_arm_at_rest_shows_no_delay() -> None:
-    estimator = DelayEstimator(calibrated(), P_FLANGE_SENSOR_M)
-    samples, states = recording(0.02, scale=0.0)
-    estimator.learn([samples], lambda: [states])
-    assert (estimator.delay_s, estimator.sigma_s) == (0.0, 0.05)
-
-
-def test_recordings_of_different_times_are_rejected() -> None:
-    samples, states = recording(0.0)
-    with pytest.raises(BadDataset, match="no time in common"):
-        list(pair_blocks([samples], [states], 100.0))
 
 
 def test_lost_samples_that_nothing_counts_bend_the_line_for_some_seconds_only() -> None:

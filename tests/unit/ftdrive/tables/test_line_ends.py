@@ -106,27 +106,6 @@ def test_a_damaged_table_is_read_whole_or_named(seed: int, tmp_path: Path) -> No
         assert not lost or "left out" in table.words, content
 
 
-def test_a_long_header_is_read_and_a_strange_one_takes_no_time(tmp_path: Path) -> None:
-    path = tmp_path / "t.csv"
-    path.write_text("# settings\n" * 20_000 + PLAIN)
-    assert Table(path).dataset().wrench.shape == (24, 6)
-    for cell in (" " * 30_000, "(" + " " * 30_000 + "x", "#" + " " * 30_000, "[" * 65_536):
-        path.write_text(f"name{cell}name,{PLAIN}")
-        with pytest.raises(BadDataset, match="no orientation among the columns 1, 2"):
-            Table(path).dataset()
-        # One name among others, so long that no unit is looked for behind it.
-        path.write_text(f"t{cell}x{PLAIN.removeprefix('t')}")
-        assert Table(path).dataset().wrench.shape == (24, 6)
-
-
-def test_a_long_name_has_no_unit(tmp_path: Path) -> None:
-    path = tmp_path / "t.csv"
-    for name in ("fx" + " " * 300 + "[kN]", "fx [" + " " * 300 + "kN]"):
-        path.write_text(PLAIN.replace(",fx,", f",{name},"))
-        with pytest.raises(BadDataset, match="--columns"):
-            Table(path).dataset()
-
-
 def test_an_impossible_date_is_named_and_a_blank_may_stand_before_its_zone(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     path.write_text("t,fx\n" + "2026-01-01 12:00:00 Z,1\n" * 40)

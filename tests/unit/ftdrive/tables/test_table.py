@@ -103,13 +103,6 @@ def test_dates_are_times(zone: str, between: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(table.dataset().t_s, np.arange(24) / 4, atol=1e-6)
 
 
-def test_rows_without_a_wrench_are_left_out_and_counted() -> None:
-    gaps = {name: np.where(np.arange(24) < 2, np.nan, values) for name, values in wrench(POSES).items()}
-    table = Table(t(POSES) | gaps | quaternion(POSES))
-    assert len(table.dataset()) == 22
-    assert table.words == "2 of 24 rows without wrench or orientation left out"
-
-
 def test_standard_errors_are_those_of_the_axes_of_the_sensor() -> None:
     sigma = columns("sigma_fx sigma_fy sigma_fz sigma_tx sigma_ty sigma_tz", np.full((24, 6), 0.1))
     plain = wrench(POSES) | quaternion(POSES) | sigma
@@ -210,10 +203,3 @@ def test_ordinary_tables_have_one_row_per_pose(turned_deg: float) -> None:
     assert len(data) == len(rows["fx"])
     assert data.wrench_cov is None
     assert not data.n_samples.any()
-
-
-def test_a_slow_turn_is_no_single_pose() -> None:
-    turned = Rotation.from_rotvec(np.linspace(0, np.radians(6), 600)[:, None] * [0, 0, 1])
-    rows, _ = dwells(600)
-    data = Table(rows | columns(MATRIX, turned.as_matrix().reshape(-1, 9))).dataset()
-    assert 25 <= len(data) <= 35

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from errno import ENOSPC, EPIPE
 from pathlib import Path
-from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
@@ -19,14 +18,11 @@ import ftdrive.cli as cli_module
 from ftdrive.cli import cli
 from ftdrive.cli import run as cli_run
 from ftdrive.errors import Declined, in_a_sentence
-from ftdrive.planning import planner
-from ftdrive.planning.plan import Plan
 from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.lines import Line
 from ftdrive.terminal.text import echo, in_whole_words, print_table
 from ftdrive.words.text import visible
 
-PLAN = ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal"]
 HELD = ["calibrate", "--robot", "10.0.0.1", "--sensor", "ati-can://can0"]
 
 
@@ -55,22 +51,6 @@ def test_help_breaks_no_address_and_cuts_no_sentence() -> None:
     assert "or play them to the driver" in run("transcript", "--help").stdout
     for command in ("export", "fleet", "loads", "transcript", "config"):
         assert "..." not in run(command, "--help").stdout.replace("[ARGS]...", "")
-
-
-def test_quiet_leaves_only_errors_and_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan_for, plans = planner.plan_for, list[Plan]()
-
-    def plan_once(*arguments: Any, **options: Any) -> Plan:
-        plans.extend([] if plans else [plan_for(*arguments, **options)])
-        return plans[0]
-
-    monkeypatch.setattr("ftdrive.commands.plan.plan_for", plan_once)
-    shown, quiet = run(*PLAN), run("-q", *PLAN)
-    assert "Predicted" in shown.stdout
-    assert shown.stderr.splitlines()[-2:] == ["Next", "   ftdrive calibrate --minimal   (asks before anything moves)"]
-    assert "Next" not in shown.stdout
-    assert (quiet.exit_code, quiet.stderr, quiet.stdout) == (0, "", shown.stdout)
-    assert '"steps"' in run("-q", *PLAN, "--json").stdout
 
 
 def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path, snapshot: SnapshotAssertion) -> None:

@@ -18,8 +18,8 @@ from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
 from ftdrive.view.page import Page
-from ftdrive.view.plan_page import PlanPage, describe_move
-from ftdrive.view.scene import arm_parts, turned_up
+from ftdrive.view.plan_page import PlanPage
+from ftdrive.view.scene import turned_up
 
 
 @pytest.fixture(scope="module")
@@ -61,23 +61,6 @@ def parts_of(shown: Shown) -> dict[str, Any]:
 def control(shown: Shown, name: str) -> dict[str, Any]:
     (found,) = [one for one in parts_of(shown)["controls"]["controls"] if one["name"] == name]
     return dict(found)
-
-
-def arm_is_at(shown: Shown, q_rad: Any) -> bool:
-    parts = parts_of(shown)
-    wanted = arm_parts(shown.arm, q_rad)
-    return all(np.allclose(parts[name]["at"], part["at"], atol=1e-3) for name, part in wanted.items() if part)
-
-
-def test_viewers_step_from_pose_to_pose(shown: Shown, page: Page, plan: Plan) -> None:
-    for name, at in (("next", 1), ("next", 2), ("previous", 1), ("previous", 0), ("previous", 5), ("next", 0)):
-        page.act("viewer 0", name, None)
-        assert arm_is_at(shown, plan.nodes_rad[at]), (name, at)
-        assert control(shown, "along")["text"].startswith(f"pose {at + 1} of 6, ")
-    page.act("viewer 0", "largest", None)
-    largest = int(np.argmax([step.turn_rad for step in plan.steps]))
-    assert arm_is_at(shown, plan.nodes_rad[largest])
-    assert parts_of(shown)["state"]["head"] == describe_move(plan, largest)[0]
 
 
 def test_one_button_plays_and_pauses_and_a_step_pauses(shown: Shown, page: Page) -> None:

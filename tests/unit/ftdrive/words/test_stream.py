@@ -1,15 +1,11 @@
 """What the model of a stream keeps: means, extremes, contact, and the recent past in memory of fixed size."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
 from ftdrive.stream.feed import History
-from ftdrive.stream.samples import Block
 from ftdrive.words.stream import ShownWrench, StreamSummary, View
 from tests.unit.ftdrive.terminal.fake_stream import R_BASE_FLANGE, SIGMA, FakeStream, SteppedFeed
 
@@ -79,25 +75,6 @@ def test_the_noise_is_compared_once_with_that_of_the_calibration(noise: float, s
         view = rig.run(10)
     assert [(check.name, check.state) for check in view.checks] == [("noise.change", state)]
     assert len(view.notes) == (state == "warning")
-
-
-def test_noise_is_not_judged_while_the_arm_moves() -> None:
-    class Moving(FakeStream):
-        def read(self) -> Block:
-            turn = Rotation.from_rotvec([0.0, 0.0, 0.01 * self.blocks]).as_matrix()
-            block = super().read()
-            return replace(block, R_base_flange=block.R_base_flange @ turn, raw=block.raw * 10)
-
-    rig = Rig(Moving(), dataset(1.0))
-    for _ in range(30):
-        view = rig.run(10)
-    assert not view.checks
-
-
-def test_a_failed_check_is_among_the_events() -> None:
-    check = Check("calibration.devices", "failed", "the calibration was made with the sensor A", "ftdrive calibrate")
-    view = Rig(FakeStream(), None, check).run(1)
-    assert view.notes[0].text == "the calibration was made with the sensor A. Fix: ftdrive calibrate"
 
 
 def filled(span_s: float, duration_s: float, rate_Hz: int, block: int = 7) -> tuple[History, np.ndarray, np.ndarray]:

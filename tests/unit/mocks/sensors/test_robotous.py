@@ -106,17 +106,6 @@ def test_can_node_answers_at_its_identifiers(readings: Readings) -> None:
     assert node.answer(CanFrame(0x70, command("0A"))) == [CanFrame(0x71, sample[:8]), CanFrame(0x72, sample[8:])]
 
 
-@pytest.mark.parametrize("axis", [0, 5])
-def test_overload_bits_and_counts(sensor: RobotousSensor[bytes], readings: Readings, axis: int) -> None:
-    unloaded = WRENCH * (np.arange(6) != axis)
-    rated = np.array([200, 200, 200, 8, 8, 8]) * np.eye(6)[axis]
-    for times in (0, 1.19, 1.2, -1.5, 0):
-        readings.wrench = unloaded + times * rated
-        loaded = abs(times) >= 1.2
-        assert [field[13] for field in sensor.samples(3)] == [loaded * (0x20 >> axis)] * 3
-    assert list(sensor.execute(command("12"))[0][1:7]) == [int(i == axis) for i in range(6)]
-
-
 def test_readings_are_clipped_not_wrapped(sensor: RobotousSensor[bytes], readings: Readings) -> None:
     readings.wrench = np.array([1000, -1000, 0, 0, 0, 0.0])
     assert sensor.samples(1)[0][1:5] == b"\x7f\xff\x80\x00"
