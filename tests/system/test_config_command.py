@@ -46,29 +46,6 @@ def test_what_is_shown_can_be_used_in_its_place(monkeypatch: pytest.MonkeyPatch)
             assert load(Path("copy.toml")) == cell
 
 
-def test_origins_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    Path("ftdrive.toml").write_text(CELL)
-    monkeypatch.setenv("FTDRIVE_ROBOT_HOST", "10.0.0.2")
-    lines = run("config", "show", "--origin").stdout.splitlines()
-    origins = {line.split("=")[0].strip(): line.rsplit("#", 1)[1].strip() for line in lines[1:] if "=" in line}
-    assert origins["host"] == "FTDRIVE_ROBOT_HOST"
-    assert origins["speed_deg_s"] == "ftdrive.toml"
-    assert origins["average_s"] == "default"
-    assert origins["# height_mm"] == "not set"
-    assert "FTDRIVE_ROBOT_HOST" not in run("config", "show").stdout
-
-    answer = json.loads(run("config", "show", "--origin", "--json").stdout)
-    assert answer["schema_version"] == 1
-    assert answer["config"]["robot"]["host"] == "10.0.0.2"
-    assert answer["config"]["sensor"]["height_mm"] is None
-    assert (
-        answer["origin"]["robot"] | {"host": "FTDRIVE_ROBOT_HOST", "speed_deg_s": "ftdrive.toml"}
-        == answer["origin"]["robot"]
-    )
-    assert answer["origin"].keys() == answer["config"].keys()
-    assert "origin" not in json.loads(run("config", "show", "--json").stdout)
-
-
 def plan(*arguments: str) -> dict[str, object]:
     outcome = run("plan", "--json", *arguments)
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)

@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -162,18 +161,6 @@ def test_nothing_counts_as_measured_until_the_operator_sets_it(addresses: list[s
     assert "until then nothing moves" in said
     Path("ftdrive.toml").write_text(text.replace("measured = false", "measured = true"))
     assert load().workcell.measured is True
-
-
-def test_what_was_not_asked_is_left_to_the_users_file(addresses: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = Path("user/ftdrive").absolute()
-    folder.mkdir(parents=True)
-    (folder / "ftdrive.toml").write_text(
-        'format = "ftdrive.config/1"\n[site]\ng_m_s2 = 9.81\n[robot]\nspeed_deg_s = 20\n'
-    )
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(folder.parent))
-    assert run(*addresses, *TOOL, "--yes").exit_code == 0
-    assert (load().site.g_m_s2, load().robot.speed_deg_s) == (9.81, 20)
-    assert "site" in tomllib.loads(Path("ftdrive.toml").read_text())
 
 
 def test_an_existing_file_is_never_overwritten() -> None:

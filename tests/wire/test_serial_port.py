@@ -86,34 +86,12 @@ def send_and_read(far_side: FarSide, port: SerialPort, sent: bytes, size: int, a
     return data, damaged + rest
 
 
-def test_marks_are_asked_for_once_opened_and_stay(far_side: FarSide, port: SerialPort) -> None:
-    asked = termios.INPCK | termios.PARMRK
-    assert far_side.input_flags() & (asked | termios.IGNPAR | termios.BRKINT) == asked
-    far_side.send(b"1234")
-    assert port.read(2) == b"12"
-    port.write(b"x", discard=True)
-    far_side.send(b"5678")
-    assert port.read_all(1)
-    assert far_side.input_flags() & asked == asked
-
-
 def test_asking_for_marks_keeps_an_unusual_bit_rate(far_side: FarSide, port: SerialPort) -> None:
     TCGETS2 = 0x802C542A
     port.read(1)
     settings = bytearray(64)
     fcntl.ioctl(far_side.master, TCGETS2, settings)
     assert int.from_bytes(settings[40:44], sys.byteorder) == 1_250_000
-
-
-def test_marks_are_not_asked_for_without_parity(far_side: FarSide) -> None:
-    port = SerialPort("sensor", far_side.path, 115_200)
-    port.open()
-    try:
-        assert far_side.input_flags() & (termios.INPCK | termios.PARMRK) == 0
-        far_side.send(b"\xff\x00\xff")
-        assert read_until(port, 3) == (b"\xff\x00\xff", [])
-    finally:
-        port.close()
 
 
 @pytest.mark.parametrize("at_once", [1, 416])
@@ -126,15 +104,6 @@ def test_damaged_bytes_are_reported(far_side: FarSide, port: SerialPort, at_once
     far_side.make_marks_itself()
     sent = b"ab" + b"\xff\x00c" + b"\xff\xff" + b"\xff\x00\xff" + b"\x00" + b"\xff\x00\x00" + b"z"
     assert send_and_read(far_side, port, sent, 8, at_once) == (b"abc\xff\xff\x00\x00z", [2, 4, 6])
-
-
-def test_what_is_thrown_away_takes_a_cut_mark_along(far_side: FarSide, port: SerialPort) -> None:
-    far_side.make_marks_itself()
-    far_side.send(b"a\xff")
-    assert port.read_marked(2) == (b"a", [])
-    port.write(b"x", discard=True)
-    far_side.send(b"\x00b")
-    assert read_until(port, 2) == (b"\x00b", [])
 
 
 def test_a_port_opened_again_begins_empty(far_side: FarSide, port: SerialPort) -> None:

@@ -6,11 +6,9 @@ from pathlib import Path
 import pytest
 
 from ftdrive.cell.config import (
-    NOMINAL_ORIENTATION_DEG,
     RULES,
     as_toml,
     load,
-    orientation_accuracy_deg,
     settings,
     user_folder,
     variable,
@@ -175,21 +173,6 @@ def test_a_password_of_the_store_reaches_no_file() -> None:
     Path("ftdrive.toml").write_text(GOOD + '[store]\nurl = "store.sqlite"\n')
     with pytest.raises(ConfigError, match=r"\[store\] url = 'store.sqlite' cannot be used"):
         load()
-
-
-@pytest.mark.parametrize(
-    ("host", "declared", "assumed"),
-    [
-        ("192.168.0.1", None, None),
-        (None, 0.02, 0.02),
-        ("ros2:/joint_states?urdf=arm.urdf&flange=flange", None, NOMINAL_ORIENTATION_DEG),
-        ("ros2:/joint_states?urdf=arm.urdf&flange=flange", 0.0, 0.0),
-    ],
-)
-def test_an_arm_by_a_urdf_is_less_exact_unless_it_is_declared(
-    host: str | None, declared: float | None, assumed: float | None
-) -> None:
-    assert orientation_accuracy_deg(host, declared) == assumed
 
 
 @pytest.mark.parametrize(

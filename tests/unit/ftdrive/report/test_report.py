@@ -226,20 +226,6 @@ def test_the_tip_is_the_far_end_of_the_described_tool() -> None:
     np.testing.assert_allclose(R @ tip_of(described), [0.005, -0.003, 0.14])
 
 
-def test_a_moved_centre_of_mass_is_the_only_group_that_changed() -> None:
-    before = result()
-    step = np.zeros(15)
-    step[9] = 8 * np.sqrt(2 * before.covariance[9, 9])
-    after = replace(before, parameters=before.parameters.moved(step), provenance={"dataset_sha256": "other"})
-    found = comparison_facts(after, before)
-    changed = [one["name"] for one in found["groups"] if one["p_value"] < 1e-3]
-    assert changed == ["centre of mass", "all"]
-    assert found["parameters"][9]["change"] == pytest.approx(step[9])
-    assert found["parameters"][9]["sigmas"] == pytest.approx(8)
-    assert not found["same_data"]
-    assert comparison_facts(before, before)["same_data"]
-
-
 CONFIG = {
     "site": {"g_m_s2": 9.80665},
     "workcell": {"mounting": "floor"},

@@ -2,18 +2,14 @@
 
 import json
 import sqlite3
-from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
 
-from ftcalib import CalibrationResult
 from ftdrive.cli import cli
 from ftdrive.report.page import render_page
-from ftdrive.report.subject import trust_facts
 from ftdrive.store.database import default_file
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
@@ -28,26 +24,6 @@ def calibrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir(parents=True)
     result(0).save(folder / "calibration.json")
     return folder
-
-
-def known(source: Path, store_url: Callable[[], str | None] = lambda: None) -> dict[str, Any]:
-    loaded = CalibrationResult.load(source / "calibration.json" if source.is_dir() else source)
-    return trust_facts(loaded, source, store_url, NOW)
-
-
-def test_the_later_of_run_folders_and_store_counts(calibrated: Path, tmp_path: Path) -> None:
-    assert known(calibrated) == {"words": "10 d old, not verified", "last_verification": None, "store_error": ""}
-    verified(new_run(tmp_path / "runs", "verify-1"), result(0).id, 2)
-    for source in (calibrated, calibrated / "calibration.json"):
-        found = known(source)
-        assert found["words"] == "10 d old, verified 8 d ago"
-        assert found["last_verification"]["path"] == str(tmp_path / "runs/verify-1/verification.json")
-    verified(new_run(tmp_path / "elsewhere", "verify-2"), result(0).id, 9.5, passed=False)
-    Store().index(tmp_path / "elsewhere")
-    assert known(calibrated)["words"] == "10 d old, VERIFICATION FAILED 12 h ago (bias)"
-    verified(new_run(tmp_path / "runs", "verify-3"), result(0).id, 9.75)
-    verified(new_run(tmp_path / "runs", "verify-4"), result(1).id, 9.9, passed=False)
-    assert known(calibrated)["words"] == "10 d old, verified 6 h ago"
 
 
 def report(*arguments: str | Path) -> Result:

@@ -1,55 +1,33 @@
-"""The distance of a reading from a free tool, its limit, and what joins readings to contacts."""
+"""The limit of the distance of a reading from a free tool."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from ftcalib.model import Array
 from ftdrive.stream.contact import ContactTest, Inertia
 from ftdrive.stream.noise import SensorNoise
 from tests.unit.ftdrive.stream.simulated import KnownNoise, calibrated, paired
 
 RATE_HZ, SIZE = 1000.0, 20
 """A reading is 0.02 s."""
-MASS_KG = 1.5
 BEYOND = np.repeat([1e-4, 1e-6], 3)
-RNG = np.random.default_rng(3)
-ROOT = RNG.standard_normal((6, 6)) * np.repeat([0.05, 0.002], 3)[:, None]
-NOISE = SensorNoise(np.eye(6), ROOT @ ROOT.T, np.diag(np.repeat([1e-3, 1e-5], 3)), 300.0)
-R = np.linalg.qr(RNG.standard_normal((3, 3)))[0]
-OFFSET = np.repeat([0.03, 0.001], 3)
-FRICTION_AXIS = np.array([0.0, 0.6, 0.8])
-
-
-def judged(
-    test: ContactTest,
-    residual: Array,
-    predicted: Array,
-    state: int,
-    felt: Array,
-    inertia: Inertia,
-    known: SensorNoise = NOISE,
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    test.expect(calibrated(), MASS_KG, tensor_known=False)
-    n = len(residual)
-    motion: Any = np.full(n, state, np.int8), np.tile(felt, (n, 1))
-    noise: Any = KnownNoise(known)
-    free: Any = SimpleNamespace(
-        windows=SimpleNamespace(steps=lambda n: np.zeros(n, int)),
-        add=lambda *_: None,
-        filter=SimpleNamespace(changes=0, offset=lambda uncertainty, _: (OFFSET, uncertainty)),
-    )
-    rows = paired(np.tile(R, (n, 1, 1)))
-    return test.judge(residual, predicted, rows, motion, noise, free, delay_sigma_s=0.003, inertia=inertia)
 
 
 def limit_of(rate: float, dof: float) -> float:
-    test, nothing = ContactTest(RATE_HZ, rate, BEYOND, FRICTION_AXIS), np.zeros((2 * SIZE, 6))
-    judged(test, nothing, nothing, 0, np.zeros(6), Inertia.EXACT, replace(NOISE, dof=dof))
+    test, n = ContactTest(RATE_HZ, rate, BEYOND, np.array([0.0, 0.6, 0.8])), 2 * SIZE
+    test.expect(calibrated(), 1.5, tensor_known=False)
+    nothing = np.zeros((n, 6))
+    noise: Any = KnownNoise(SensorNoise(np.eye(6), np.eye(6), np.diag(np.repeat([1e-3, 1e-5], 3)), dof))
+    free: Any = SimpleNamespace(
+        windows=SimpleNamespace(steps=lambda n: np.zeros(n, int)),
+        add=lambda *_: None,
+        filter=SimpleNamespace(changes=0, offset=lambda uncertainty, _: (np.zeros(6), uncertainty)),
+    )
+    motion = np.zeros(n, np.int8), nothing
+    rows = paired(np.tile(np.eye(3), (n, 1, 1)))
+    test.judge(nothing, nothing, rows, motion, noise, free, delay_sigma_s=0.003, inertia=Inertia.EXACT)
     return test.limit
 
 

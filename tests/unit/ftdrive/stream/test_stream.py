@@ -212,18 +212,6 @@ def tools(cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cell:
     return cell
 
 
-def test_a_stream_is_opened_by_the_name_of_a_tool(tools: Cell) -> None:
-    with open_stream(tools.config, tool="drill") as stream:
-        assert stream.info.tool == "drill"
-        assert stream.info.calibration_name.endswith("runs/drill/calibration.json")
-        assert stream.read().wrench[:, 0].mean() == pytest.approx(-7.0, abs=1.0)
-    with pytest.raises(ConfigError, match=r"'welder'.*drill, gripper"), open_stream(tools.config, tool="welder"):
-        pass
-    with pytest.raises(ConfigError, match="both a calibration and a tool"):
-        open_stream(tools.config, tools.calibration, tool="drill")
-
-
-@pytest.mark.slow
 def test_the_tool_is_switched_while_the_devices_stay_open(tools: Cell) -> None:
     tools.sensor.motion = tools.arm.motion = Motion()
     with open_stream(tools.config, tool="drill", stages=Stages(lowpass_Hz=200.0)) as stream:

@@ -10,11 +10,10 @@ from ftdrive.stream.feed import FeedNote
 from ftdrive.stream.samples import WrenchFrame
 from ftdrive.terminal import live_panels
 from ftdrive.terminal.lines import GOOD, WARNING, Line
-from ftdrive.terminal.live_panels import other_wrench_lines
 from ftdrive.terminal.live_screen import draw_live
 from ftdrive.words.stream import View
 from ftdrivers.interfaces import Fact
-from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, TARE, FakeStream
+from tests.unit.ftdrive.terminal.fake_stream import FakeStream
 from tests.unit.ftdrive.words.test_stream import Rig, reading_of
 
 SENSOR = WrenchFrame("sensor", "sensor")
@@ -38,24 +37,6 @@ def test_range_is_used_by_the_load_where_the_zero_is_arbitrary(view: View) -> No
     assert (round(share, 3), axis) == (0.4, "Fz")
     plain = replace(view.info.sensor, facts=facts)
     assert replace(view, reading=reading, info=replace(view.info, sensor=plain)).used_range != (share, axis)
-
-
-def test_the_wrench_is_shown_with_fewer_stages_and_in_other_frames(view: View) -> None:
-    push = np.array([1.0, -2.0, -5.0, 0.1, 0.2, -0.3])
-    reading = replace(reading_of(view), raw=FREE + TARE + push, R_base_flange=R_BASE_FLANGE, frame=SENSOR)
-    lines = [text(line) for line in other_wrench_lines(replace(view, reading=reading))]
-    found = {line[:21].strip(): [float(one) for one in line[21:].split()] for line in lines[1:]}
-    assert lines[0].split() == ["in", "sensor", "@", "sensor", "Fx", "Fy", "Fz", "Tx", "Ty", "Tz"]
-    rounded = {"as measured": FREE + TARE + push, "without bias": FREE + push - BIAS, "and without gravity": push}
-    for name, wrench in rounded.items():
-        np.testing.assert_allclose(found[name], wrench, atol=0.0051)
-    R_flange_sensor = PARAMETERS.R_flange_sensor
-    np.testing.assert_allclose(found["flange @ flange"][:3], R_flange_sensor @ push[:3], atol=0.0051)
-    below = np.cross([0, 0, 0.035], R_flange_sensor @ push[:3])  # the sensor is 35 mm below the flange
-    np.testing.assert_allclose(found["flange @ flange"][3:], R_flange_sensor @ push[3:] + below, atol=0.00051)
-    np.testing.assert_allclose(found["base @ tcp"][:3], R_BASE_FLANGE @ R_flange_sensor @ push[:3], atol=0.0051)
-    silent = [text(line) for line in other_wrench_lines(replace(view, reading=reading, silent="the arm"))]
-    assert all(line.count("--.--") == 6 for line in silent[1:])
 
 
 def test_a_calibration_of_another_cell_is_marked_in_the_header_and_not_green(view: View) -> None:
