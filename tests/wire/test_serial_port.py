@@ -33,9 +33,6 @@ class FarSide:
         self.path = os.ttyname(slave)
         self._slave = slave
 
-    def input_flags(self) -> int:
-        return int(termios.tcgetattr(self.master)[0])
-
     def make_marks_itself(self) -> None:
         settings = termios.tcgetattr(self.master)
         settings[0] &= ~termios.PARMRK

@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from math import sqrt
 
 import numpy as np
 import pytest
@@ -13,8 +12,6 @@ from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.exports.formats import FORMATS
 from ftdrive.exports.registry import Settings, export_calibration
 from tests.unit.ftdrive.exports.example import MEASURED, UPRIGHT, calibration, rejected, tilted
-
-LEVER_M = sqrt(0.01**2 + 0.02**2 + 0.05**2)
 
 
 @pytest.mark.parametrize("name", [name for name, one in FORMATS.items() if "tilt" not in one.expresses])

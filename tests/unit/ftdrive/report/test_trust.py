@@ -2,7 +2,6 @@
 
 import json
 import sqlite3
-from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -12,9 +11,7 @@ from ftdrive.cli import cli
 from ftdrive.report.page import render_page
 from ftdrive.store.database import default_file
 from ftdrive.store.store import Store
-from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
-
-NOW = FIRST + timedelta(days=10)
+from tests.unit.ftdrive.store.run_folders import new_run, result, verified
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Times of measurement, interpolated poses, and which sample gets which pose."""
 
-from dataclasses import replace
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,7 +8,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from ftcalib.model import angle_between
 from ftcalib.motion.samples import RATE_TOLERANCE, SampleClock
 from ftdrive.stream.pairing import Pairing, PoseTrack
-from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.unit.ftdrive.stream.simulated import T0_NS, Motion
 
 
@@ -87,20 +84,6 @@ def test_the_pose_is_that_of_the_measurement() -> None:
     R = np.concatenate([paired.R_base_flange for paired in late])
     seq = np.concatenate([paired.seq for paired in late])
     assert angle_between(R, motion.pose(seq * 1e-3)[0]).max() < 5e-4  # half a millisecond at 1 rad/s
-
-
-def recording(delay_s: float, scale: float = 1.0) -> tuple[FtSamples, ArmStates]:
-    """A recording with exact times, but the wrench is late."""
-    motion = Motion(scale, 2 * scale)
-    samples, states = motion.links(12.0, 0.0, rate_Hz=500.0, batch_s=1e-9)
-    t_ns = T0_NS + np.arange(len(samples)) * 2_000_000
-    samples = FtSamples.of(t_ns + round(delay_s * 1e9), samples.seq, samples.wrench)
-    exact = T0_NS + np.arange(len(states)) * 2_000_000
-    return samples, replace(states, t_host_ns=exact)
-
-
-PUSHED = np.zeros((6000, 6))
-PUSHED[1500:2500, :3] = np.array([5.0, -8.0, 3.0]) * np.sin(np.arange(1000) * 0.02)[:, None]
 
 
 def test_lost_samples_that_nothing_counts_bend_the_line_for_some_seconds_only() -> None:

@@ -7,7 +7,6 @@ import pytest
 
 from ftdrive.runs.calibration import FOREIGN
 from ftdrive.stream.feed import FeedNote
-from ftdrive.stream.samples import WrenchFrame
 from ftdrive.terminal import live_panels
 from ftdrive.terminal.lines import GOOD, WARNING, Line
 from ftdrive.terminal.live_screen import draw_live
@@ -15,8 +14,6 @@ from ftdrive.words.stream import View
 from ftdrivers.interfaces import Fact
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream
 from tests.unit.ftdrive.words.test_stream import Rig, reading_of
-
-SENSOR = WrenchFrame("sensor", "sensor")
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ from ftmocks.kinematics import MODELS, vector6
 from ftmocks.ur.swing import Swing
 
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
-STEP_S = 0.004
 
 
 def test_a_swing_starts_and_ends_at_rest_where_it_began_after_whole_periods() -> None:
