@@ -18,11 +18,9 @@ from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan, digest, fingerprints
 from ftdrive.planning.planner import TOOL_POSES, USUAL_POSTURE_RAD, guess_of, plan_for, plan_tour
 from ftdrivers.sweep import Sweep
-from ftdrivers.ur.kinematics import MODELS as NOMINAL
-from ftdrivers.ur.kinematics import Array, Kinematics
+from ftdrivers.ur.kinematics import MODELS, Array, Kinematics
 from tests.own_kinematics import drawn
 
-MODELS = ("UR3e", "UR5e", "UR10e", "UR16e", "UR20", "UR30")
 TOOLS = (
     (Cylinder(0, 0.15, 0.1),),
     (Cylinder(0, 0.2, 0.1),),
@@ -141,7 +139,7 @@ def test_a_plan_of_version_1_is_read_and_proven_for_this_arm(tmp_path: Path) -> 
 
 def test_a_plan_that_only_another_arm_has_room_for_is_refused() -> None:
     """A wall as near as the margin allows to the arm that the plan was made for is too near for another one."""
-    one, other = NOMINAL["UR5e"], drawn("UR5e")
+    one, other = MODELS["UR5e"], drawn("UR5e")
     plan = planned(certifier_of(kinematics=one))
     tip = [tips(certifier_of(kinematics=k).arm, plan.nodes_rad)[:, 0] for k in (one, other)]
     nearer = (tip[1] - tip[0]).mean(axis=0)

@@ -1,4 +1,4 @@
-"""What the panels of the live screen compute: places, angles and frames, from readings with known numbers."""
+"""What the panels of the live screen say, and what is read on a low screen."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What the model of a stream keeps: means, extremes, contact, and the recent past in memory of fixed size."""
+"""What the model of a stream keeps: means, extremes, what is silent, and the noise."""
 
 import numpy as np
 import pytest

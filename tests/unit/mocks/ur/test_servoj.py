@@ -1,4 +1,4 @@
-"""servoj: a program that evaluates a curve every cycle, how the arm follows it, and what the controller stops."""
+"""servoj: a program that evaluates a curve every cycle, and what the controller stops."""
 
 import math
 

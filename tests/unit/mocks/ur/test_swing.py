@@ -1,4 +1,4 @@
-"""The operator's program that swings the arm: what the flange reaches, and where it ends."""
+"""The operator's program that swings the arm: where it ends."""
 
 import numpy as np
 import pytest
