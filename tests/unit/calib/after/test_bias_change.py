@@ -54,13 +54,3 @@ def test_both_sigmas_are_those_of_a_simulation() -> None:
     means = (values.mean(axis=1) - CHANGE) / np.hypot(calibration_sigma, sigma / np.sqrt(20))
     assert np.abs(np.sum(means**2, axis=0) / 100 - 1).max() < 6 * np.sqrt(2 / 100)
     assert np.abs(means.mean(axis=0)).max() < 6 / np.sqrt(100)
-
-
-def test_a_channel_without_any_noise_has_a_change_too() -> None:
-    """As of a coarse sensor whose samples are all equal."""
-    noise = np.asarray(block_diag(*(np.diag(np.r_[0.0, SIGMA[1:] ** 2]) for _ in range(6))))
-    R = orientations(6, 3)
-    expected = Expected(Update(TRUTH, covariance_of_a_calibration(), 0.0, 0), noise, np.inf)
-    change, *sigmas = expected.bias_change(R, predict(CHANGED, R))
-    np.testing.assert_allclose(change, CHANGE, atol=1e-9)
-    assert np.isfinite(sigmas).all()

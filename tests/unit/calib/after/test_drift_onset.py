@@ -112,12 +112,3 @@ def test_the_likeliest_onset_is_that_of_generalised_least_squares(since: float) 
         assert found.p_value[k] == pytest.approx(
             max(chi2.sf(chi2_of_slope, 1), f.sf(chi2_of_slope / scatter, 1, 9)), rel=1e-3
         )
-
-
-def test_few_or_short_series() -> None:
-    for n in range(FEWEST):
-        assert drift_onset(DAILY[:n], series(DAILY[:n]), np.ones((n, 6)), COMMON) is None
-    hours = np.linspace(0.01, LEAST_DAYS / 2, 30)
-    assert not searched(hours, series(hours)).found.any()
-    same = np.full(10, 3.0)
-    assert not searched(same, series(same)).found.any()

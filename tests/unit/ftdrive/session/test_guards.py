@@ -217,3 +217,12 @@ def test_a_noisy_sensor_is_given_more_room() -> None:
     pushed = np.add(WEIGHT, [12, 0, 0, 0, 0, 0])
     assert Looks(contact(quiet=2.0), moving=False).trips(30, wrench=pushed) is None
     assert Looks(contact(quiet=0.1), moving=False).trip(30, wrench=pushed).hazard == 14
+
+
+def test_a_protective_stop_is_reported_with_the_payload_that_may_have_caused_it() -> None:
+    stopped = replace(STATUS, fault=DeviceFault("protective stop", "…"), safety_mode="protective stop")
+    assert "1.50 kg" in str(Looks(SafetyGuard()).trip(status=stopped))
+    without = str(Looks(SafetyGuard()).trip(status=replace(stopped, payload_kg=None)))
+    assert without.endswith("payload or centre of mass")
+    braked = replace(STATUS, fault=DeviceFault("emergency stop", "…"), safety_mode="robot emergency stop")
+    assert "payload" not in str(Looks(SafetyGuard()).trip(status=braked))
