@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Parameters, SensorMatrix
 from ftdrive.checks.arm import RATED_KG, flange_load, margin_in_words
@@ -37,34 +36,6 @@ def test_sensor_and_tool_add_up() -> None:
     load = flange_load(calibrated(), 0.25, 0.04)
     assert load.mass_kg == pytest.approx(1.25)
     assert load.p_flange_com_m == pytest.approx([0.0, 0.016, 0.076])
-
-
-def test_sigma_agrees_with_numerical_derivatives() -> None:
-    rng = np.random.default_rng(4)
-    root = rng.normal(size=(15, 15)) * 1e-3
-    covariance = root @ root.T
-    R = Rotation.from_rotvec([0.3, -0.5, 1.1]).as_matrix()
-    result = calibrated(1.3, R, (0.02, -0.03, 0.05), covariance, up_base=(0.6, 0.0, 0.8))
-
-    def summed(parameters: Parameters) -> Array:
-        moved = CalibrationResult(parameters, covariance, np.zeros((6, 6)), 1.0, 21, "measured", G_M_S2, "ml", ())
-        load = flange_load(moved, 0.3, 0.04)
-        return np.array([load.mass_kg, *load.p_flange_com_m])
-
-    step = 1e-6
-    jacobian = np.array(
-        [
-            (summed(result.parameters.moved(one)) - summed(result.parameters.moved(-one))) / (2 * step)
-            for one in step * np.eye(15)
-        ]
-    ).T
-    expected = np.diag(jacobian @ covariance @ jacobian.T).copy()
-    common_gain = np.zeros(15)
-    common_gain[3:6] = 0.002 * result.gravity_force_base_N
-    expected += (jacobian @ common_gain) ** 2
-    expected[3] += (0.3 / 1.6 * 0.04) ** 2 / 12
-    load = flange_load(result, 0.3, 0.04)
-    assert [load.sigma_kg, *load.sigma_m] == pytest.approx(np.sqrt(expected), rel=1e-6)
 
 
 def test_the_margin_names_rated_payload_and_model() -> None:

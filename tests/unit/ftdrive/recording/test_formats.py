@@ -308,20 +308,3 @@ def test_parquet_that_pyarrow_has_copied_stays_a_recording_and_other_parquet_is_
     parquet.write_table(table.drop_columns(["fz"]), tmp_path / "c.parquet")
     with pytest.raises(BadRecording, match="columns are not those of a recording"):
         load_recording(tmp_path / "c.parquet")
-
-
-def test_mcap_ros2_reads_the_messages(paths: Sequence[Path]) -> None:
-    rows = load_recording(paths[0]).rows
-    with paths[0].open("rb") as file:
-        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        attachments = {one.name: one for one in reader.iter_attachments()}
-        summary = reader.get_summary()
-        first_ns = int(rows["t_host_ns"][1400]) + UTC_OFFSET_NS
-        found = list(reader.iter_decoded_messages(["/ft_compensated"], starting_at=first_ns, log_time_order=True))
-    assert attachments.keys() == {"calibration.json", "recording.json"}
-    assert json.loads(attachments["calibration.json"].data) == info().calibration.to_dict()
-    assert summary is not None
-    assert summary.statistics is not None
-    assert summary.statistics.message_start_time == rows["t_host_ns"][0] + UTC_OFFSET_NS
-    assert len(summary.chunk_indexes) == 11  # fifths of a second; the new frame ends one early
-    assert [decoded.wrench.force.x for *_, decoded in found] == rows["wrench"][1400:, 0].tolist()

@@ -7,8 +7,6 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 
@@ -18,7 +16,7 @@ from ftcalib.sensor_matrix import SensorMatrix, ranges
 from ftdrive.errors import ConfigError
 from ftdrive.stream import processing
 from ftdrive.stream.processing import Processor
-from ftdrive.stream.samples import Axes, Block, FrameTransform, Links, LinkStatus, Paired, Point, Stages, WrenchFrame
+from ftdrive.stream.samples import Block, FrameTransform, Links, LinkStatus, Paired, Stages, WrenchFrame
 from ftdrive.stream.stages import stages_in_words
 from tests.unit.ftdrive.stream.simulated import (
     NOISE,
@@ -34,8 +32,6 @@ from tests.unit.ftdrive.stream.simulated import (
     paired,
 )
 
-AXES: tuple[Axes, ...] = ("sensor", "flange", "base", "tcp")
-POINTS: tuple[Point | tuple[float, float, float], ...] = ("sensor", "flange", "tcp", (0.1, -0.2, 0.3))
 LINKS = Links(LinkStatus(1000.0, 1000.0, 0, 0.0), LinkStatus(500.0, 500.0, 0, 0.0), 0.0, 0.0)
 UPSIDE_DOWN = Rotation.from_euler("xz", [170, 25], degrees=True).as_matrix()
 
@@ -62,30 +58,6 @@ def kinds(processor: Processor) -> list[str]:
 
 
 # ------------------------------------------------------------------------------------------------------------- frames
-
-
-@pytest.mark.parametrize("axes", AXES)
-@pytest.mark.parametrize("about", POINTS)
-@settings(max_examples=5)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_power_is_the_same_in_every_frame(axes: Axes, about: Point | tuple[float, float, float], seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    R_base_flange = Rotation.random(rng=rng).as_matrix()
-    wrench, twist = rng.normal(size=6), rng.normal(size=6)  # velocity of the sensor origin, rate; sensor axes
-    R_flange_sensor = calibrated().R_flange_sensor
-    points = {"sensor": P_FLANGE_SENSOR_M, "flange": np.zeros(3), "tcp": P_FLANGE_TCP_M}
-    point = points[about] if isinstance(about, str) else np.array(about)
-    R_axes_sensor = {
-        "sensor": np.eye(3),
-        "flange": R_flange_sensor,
-        "base": R_base_flange @ R_flange_sensor,
-        "tcp": R_FLANGE_TCP.T @ R_flange_sensor,
-    }[axes]
-    velocity, rate = twist[:3], twist[3:]
-    at_point = velocity + np.cross(rate, R_flange_sensor.T @ (point - P_FLANGE_SENSOR_M))
-    there = FrameTransform(WrenchFrame(axes, about), info(calibrated()))(wrench[None], R_base_flange[None])[0]
-    power = there[:3] @ (R_axes_sensor @ at_point) + there[3:] @ (R_axes_sensor @ rate)
-    assert power == pytest.approx(wrench @ twist, rel=1e-9, abs=1e-9)
 
 
 def test_a_frame_needs_the_height_of_the_sensor() -> None:
