@@ -96,7 +96,7 @@ def _parser() -> argparse.ArgumentParser:
         "--load",
         type=_load,
         metavar="KG@x,y,z",
-        help="a load that hangs on a string of 250 mm; its hook in mm from the flange, in flange axes",
+        help="a load that hangs from a 250 mm string; the position of its hook, flange axes, mm",
     )
     add(
         "--swing",

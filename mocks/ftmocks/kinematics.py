@@ -183,7 +183,7 @@ def flange_motion(dh: Dh, state: JointState) -> FlangeMotion:
 def closed_form(dh: Dh, target: Array, free_q6: float = 0.0) -> Iterator[Vector6]:
     """Return all joint vectors in (-pi, pi], at most eight, with which a nominal arm has its flange at `target` (4, 4).
 
-    They differ by shoulder, wrist and elbow. If ``sin q5 = 0``, joint 6 is free and set to `free_q6`.
+    They differ in shoulder, wrist and elbow. If ``sin q5 = 0``, joint 6 is free and set to `free_q6`.
     """
     a2, a3 = dh.a[1], dh.a[2]
     d4, d6 = dh.d[3], dh.d[5]

@@ -43,7 +43,7 @@ class Recording:
 
     def __init__(self, t_s: Array, wrench: Array, q_rad: Array) -> None:
         if len(t_s) < 2:
-            raise ValueError(f"{len(t_s)} rows are not a recording, which needs two or more")
+            raise ValueError(f"a recording needs two rows or more, but this file has {len(t_s)}")
         finite = np.isfinite(t_s) & np.isfinite(wrench).all(axis=1) & np.isfinite(q_rad).all(axis=1)
         if not finite.all():
             raise ValueError(f"row {int(np.argmin(finite)) + 1} holds a value that is not finite")
@@ -157,7 +157,7 @@ class RecordedArm(Arm):
     def step(self, dt: float, t_s: float = 0.0) -> None:
         """Set the joints to those of the recording at `t_s` of the cell's clock."""
         q, qd, _qdd = self._recording.joints(t_s)
-        if q != self.q:  # keep the object of an arm at rest, by which readers recognise it
+        if q != self.q:  # while the arm rests, return the same object, by which readers recognise the rest
             self.q = self.actual_q = q
         self.qd = self.actual_qd = qd if any(qd) else ZERO6
         self.still_s = 0.0 if any(qd) else self.still_s + dt

@@ -88,7 +88,7 @@ _CHANNELS = _AXES | {"force_N": [0, 1, 2], "torque_Nm": [3, 4, 5]}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
-    """Predictive distribution of the readings of an unchanged cell, under one explanation."""
+    """Predictive distribution of the readings if the robot cell has not changed, for one model of the errors."""
 
     calibration: Update
     """Calibration whose covariance includes the drift of the bias since it was made."""

@@ -74,7 +74,7 @@ class OwnProgram:
             self.left_behind = self._starting
         except DeviceError as error:
             if self._stops_itself:
-                log.info("the control program stops the arm by itself: %s", error)
+                log.info("the stop was not sent, but the control program stops the arm without it: %s", error)
             else:
                 host = self._services.host
                 log.warning("%s did not receive the stop; press the emergency stop if it moves: %s", host, error)

@@ -1,4 +1,4 @@
-"""Rules of configuration keys in the metadata of their fields: description, unit, range, option and condition."""
+"""Rules for configuration keys, in the metadata of the fields: description, unit, range, option and condition."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field

@@ -47,7 +47,7 @@ def bundle(
         raise ConfigError("no run: give its folder, or --simulate")
     for file in transcripts:
         if kind_of(file) != "transcript":
-            raise ConfigError(f"--transcript: {file} is not a file of `ftdrive transcript record`")
+            raise ConfigError(f"--transcript: {file} was not written by `ftdrive transcript record`")
     with nullcontext(run) if run is not None else rehearsed_run(open_operator(), sensor) as folder:
         path = output or Path(f"{folder.resolve().name}.zip")
         try:

@@ -210,7 +210,7 @@ class SolvedAgain:
         self.unchanged += not (outcome.has_changed or outcome.has_other_verdict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the summary as JSON."""
+        """Return the summary as a dictionary for JSON."""
         return {"schema_version": 1, "version": __version__, **asdict(self)}
 
     def lines(self) -> Iterator[str]:

@@ -63,9 +63,9 @@ class RecordingFiles:
                 raise
 
     def complete(self) -> None:
-        """Complete all files with every sample.
+        """Write every sample that is left, and complete all files.
 
-        Raises `OSError` if a file could not be completed; its message states what each `.partial` contains.
+        Raises `OSError` if a file cannot be completed; its message states what each `.partial` contains.
         """
         files, self._files, failure = self._files, [], None
         with _delay_signals():

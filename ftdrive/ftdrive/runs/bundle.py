@@ -246,7 +246,7 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
             left_out.append(file.relative_to(folder).as_posix())
     for number, file in enumerate(transcripts, 1):
         if (text := _decode_text(read_file(file))) is None:
-            raise BadBundle(f"{file} is not a text file: give a file of `ftdrive transcript record`")
+            raise BadBundle(f"{file} is not a text file: give a file written by `ftdrive transcript record`")
         texts[f"transcripts/{number}-{file.name}"] = text
     for file in sensor_files():
         if (text := _decode_text(read_file(file))) is not None:

@@ -51,7 +51,7 @@ class RecordedRun:
             raise ValueError(f"stop {self._stop + 1} of the recording does not have the joint angles of the routine")
 
     def wait_until_still(self, **_: object) -> None:
-        """Start the measurement of a pose."""
+        """Return at once, and start the measurement of a pose."""
         self._collected = False
 
     def state(self) -> ArmReading:

@@ -334,7 +334,7 @@ class _SlowClients(logging.Handler):
         self._source.addHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log a report of the SDK."""
+        """Log a message from the SDK."""
         report = self._with_clients(record.getMessage())
         _log.warning("a client reads too slowly, so its oldest messages are dropped (%s)", report)
 

@@ -96,7 +96,7 @@ class Progress:
 
     @property
     def undriven(self) -> list[int]:
-        """Numbers of the poses, from 1, from which the planned move was left out or replaced by an approach."""
+        """Numbers of the poses, counted from 1, whose next planned move was skipped or replaced by an approach."""
         return [index + 1 for index in range(self.poses) if index not in self.driven]
 
     def index(self, stop: int) -> int:

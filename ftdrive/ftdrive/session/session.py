@@ -263,7 +263,7 @@ def describe_run(task: Task, options: SessionOptions, connected: Mapping[str, De
 
 
 def method_of_poses(name: str) -> Method:
-    """Return the method of this name. Raises `ConfigError` if it is unknown or needs more than poses."""
+    """Return the method of this name. Raises `ConfigError` if it is unknown or needs data other than poses."""
     if name not in get_args(Method):
         raise ConfigError(f"there is no method '{name}': choose one of {', '.join(get_args(Method))}")
     if name == "carlson-cayley":

@@ -205,7 +205,7 @@ class Tour:
                 self._note(f"{names[record.stop]} keeps its earlier measurement", warning=True)
         if left := [name for stop, name in names.items() if stop not in stay]:
             way = f"the arm goes on to pose {self._now.todo[0]}" if self._now.todo else "no pose is left"
-            self._note(f"skipped: {' and '.join(left)}; {way}; --resume takes skipped poses", warning=True)
+            self._note(f"skipped: {' and '.join(left)}; {way}; --resume measures skipped poses", warning=True)
 
     def _take(self, stop: int, index: int) -> None:
         step, sampling, clock = self._plan.steps[index], self._config.sampling, self._drive.watcher.clock

@@ -303,7 +303,7 @@ class ScaleState:
 
     @property
     def measured(self) -> Weight | None:
-        """The weight to show; None for a fault, except that a failed count has a weight."""
+        """The weight to show; None after a fault, unless only the number of parts could not be determined."""
         return self.weight if self.refusal in {None, "count"} else None
 
 

@@ -1,4 +1,4 @@
-"""Texts about known loads: the check of a sensor, and its matrix."""
+"""Texts for work with known loads: checking a sensor, and estimating its matrix."""
 
 from collections.abc import Iterator
 from math import degrees

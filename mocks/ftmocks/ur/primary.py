@@ -60,7 +60,7 @@ DEFAULTS = (1.0471975511965976, 1.3962634015954636, 0.25, 1.2, 0.25)
 """Default joint speed and acceleration, tool speed and acceleration, and radius of a joint, in rad, m and s."""
 
 COMPLIANCE = (0.15, 25.0, 0.0, 3.0, *[0.2] * 6, *[0.052359878] * 6, 0.0, 0.0, 0.0, 0.01745329, 0.001, 0.01)
-"""Content of package 24 in the log of version 3.10."""
+"""Content of the primary interface's package 24, as recorded from a controller with version 3.10."""
 
 _MESSAGE = struct.Struct(">iBQbB")
 _EMERGENCY_BIT, _PROTECTIVE_BIT = 0x80, 0x04

@@ -428,7 +428,7 @@ class Robot:
             self.set_mode(RobotMode.POWER_OFF)
 
     def set_safety(self, mode: SafetyMode, reason: str) -> None:
-        """Enter a safety mode, with its effects on program and power. In reduced mode, NORMAL means REDUCED."""
+        """Enter a safety mode, with its effects on program and power. While reduced mode is on, NORMAL is REDUCED."""
         if mode in PERMITTED:
             mode = SafetyMode.REDUCED if self._reduced else SafetyMode.NORMAL
         self.safety_mode = mode

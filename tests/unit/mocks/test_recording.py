@@ -75,7 +75,7 @@ HEADER = ",".join(COLUMNS)
     [
         ("", "no column t_s, raw_fx"),
         (HEADER.replace("raw_ty,", "") + "\n", "no column raw_ty$"),
-        (HEADER + "\n" + "0," * 12 + "0\n", "1 rows are not a recording"),
+        (HEADER + "\n" + "0," * 12 + "0\n", "a recording needs two rows or more, but this file has 1"),
         (HEADER + "\n" + "0," * 12 + "0\n" + "0," * 12 + "0\n", "does not rise from row 1"),
         (HEADER + "\n" + "0," * 12 + "0\n" + "1," * 12 + "nan\n", "row 2 holds"),
         (HEADER + "\n" + "0," * 12 + "0\n" + "1," * 12 + "x\n", "'x'"),

@@ -115,7 +115,7 @@ class Program(ControllerProgram):
             except Halt:
                 return False
             except RecursionError:
-                raise ScriptError("functions call each other, or expressions are nested, without end") from None
+                raise ScriptError("functions call each other endlessly, or expressions are nested too deeply") from None
             if thread.is_done:
                 self.robot.arm.release(thread.name)
         self._threads = [thread for thread in self._threads if not thread.is_done]
