@@ -151,8 +151,8 @@ class MetricsServer(Collector):
                 if (value := value_of(state)) is not None:
                     family.add_metric(_labels(state.cell, state.tool), value)
             yield family
-        weighings = CounterMetricFamily(WEIGHINGS, "Parts weighed on the last day.", labels=TOOL)
-        refusals = CounterMetricFamily(REFUSALS, "Weighings refused on the last day.", labels=(*TOOL, "code"))
+        weighings = CounterMetricFamily(WEIGHINGS, "Parts weighed on the last day with weighings.", labels=TOOL)
+        refusals = CounterMetricFamily(REFUSALS, "Refusals on the last day with weighings.", labels=(*TOOL, "code"))
         for state in cells:
             if state.weighings is not None:
                 weighings.add_metric(_labels(state.cell, state.tool), state.weighings.weighings)
