@@ -141,9 +141,7 @@ def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) 
         expected_kg = tool.mass_kg + (sensor_kg or 0.0)
         found += f"; sensor and tool weigh {expected_kg:.2f} kg"
         if abs(payload_kg - expected_kg) > max(described_cell.PAYLOAD_KG, described_cell.PAYLOAD_SHARE * expected_kg):
-            return Check(
-                name, "failed", found, "correct the payload on the pendant, or the masses in [tool] and [sensor]"
-            )
+            return Check(name, "failed", found, "correct the pendant's payload, or the masses in [tool] and [sensor]")
     if p_m is not None and not any(p_m):
         fix = "set the centre of gravity on the pendant: Installation, Payload"
         return Check(name, "warning", f"{found}; no real payload has its centre in the flange face", fix)
