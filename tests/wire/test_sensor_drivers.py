@@ -12,6 +12,8 @@ import pytest
 
 from ftdrivers.clock import Clock
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.probe import probe_serial
+from ftdrivers.sensors import SENSORS
 from ftdrivers.streaming.sensor import StreamingSensor
 from tests.wire.sensor_kinds import KINDS
 
@@ -26,6 +28,7 @@ class Emulator(Protocol):
 
     kind: Any
     clock: Clock
+    endpoint: Any
 
     def sensor(self, options: str = "", sign: int = 1) -> StreamingSensor: ...
 
@@ -58,6 +61,8 @@ def test_wrench_counts_and_samples(shared: Emulator) -> None:
     assert (samples.status == 0).all()
     assert info.serial.startswith(kind.serial)
     assert health.malformed == 0
+    if kind.scheme != "ati-can":
+        assert health.nominal_rate_Hz == pytest.approx(kind.rate_Hz, rel=0.01)
 
 
 def test_open_close_reopen_and_nothing_stays(shared: Emulator) -> None:
@@ -83,6 +88,18 @@ def test_already_streaming_when_opened(start: Start, scheme: str) -> None:
     """A client died, or the sensor streams from power-up on. Nothing arrives unasked on CAN or from a URCap."""
     with start(scheme, streaming_at_start=("127.0.0.1", 9) if scheme == "ati-netft" else True).sensor() as sensor:
         np.testing.assert_allclose(sensor.collect(0.1).wrench.mean(axis=0), WRENCH, atol=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", [name for name in SCHEMES if SENSORS[KINDS[name].scheme].wire == "serial"])
+def test_a_probe_finds_it(start: Start, scheme: str) -> None:
+    emulator = start(scheme)
+    if isinstance(emulator.endpoint, dict):
+        pytest.skip("a sensor on the controller has no port to probe")
+    answer = probe_serial(emulator.endpoint, emulator.clock)
+    assert answer is not None
+    assert answer.url is not None
+    assert answer.url.startswith(f"{emulator.kind.scheme}://")
 
 
 def test_unplugged_is_broken_at_once_and_for_good(start: Start) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ftmocks.arrays import Array
 from ftmocks.sensors.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
+from ftmocks.sensors.kind import Kind
 from ftmocks.wires.slcan import CanFrame
 from ftmocks.wires.stream import CanSensor
 
@@ -170,3 +171,14 @@ class AtiCanNode(CanSensor):
             return CanFrame((self.base << 4) + rng.randrange(16), data, extended=True)
         other_base = (self.base + rng.randrange(1, 0x80)) % 0x80
         return CanFrame((other_base << 4) + rng.randrange(16), data)
+
+
+KINDS = {
+    "can": Kind(
+        AtiCanNode,
+        "ati-can",
+        "interface=slcan&bitrate=250000&base=32",
+        {"interface": "slcan", "bitrate": 250_000, "base": 0x20},
+        {"base": 0x20, "bitrate": 250_000},
+    )
+}

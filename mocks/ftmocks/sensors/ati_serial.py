@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ftmocks.arrays import Array
 from ftmocks.sensors.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
+from ftmocks.sensors.kind import Kind
 from ftmocks.wires.modbus import (
     DEVICE_FAILURE,
     ILLEGAL_ADDRESS,
@@ -226,3 +227,6 @@ class AtiSerialBox(ModbusSensor):
         if self.saturated_axis is not None:
             gauges[:, self.saturated_axis] = GAUGE_MAX
         return gauges
+
+
+KINDS = {"serial": Kind(AtiSerialBox, "ati-serial")}

@@ -29,6 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ftmocks.sensors.kind import Kind
 from ftmocks.wires.stream import SerialSensor
 
 HEADER = b"\xaa"
@@ -251,3 +252,22 @@ class BotaBox(SerialSensor):
         """Start the stream, whose time stamps count from power-up."""
         self._stream_start_us = (self.clock.now_s() - self._powered_s) * 1e6
         self._pacer.start(1 / self.sample_s)
+
+
+def _baud_code(text: str) -> int:
+    if not text.isdecimal() or int(text) not in BAUD_RATES:
+        raise ValueError(f"unknown baud rate {text!r}; known: {', '.join(map(str, BAUD_RATES))}")
+    return BAUD_RATES.index(int(text))
+
+
+def _seconds(text: str) -> float:
+    if not 0.0 <= float(text) < np.inf:
+        raise ValueError(f"expected a time in s, got {text!r}")
+    return float(text)
+
+
+KINDS = {
+    "bota": Kind(
+        BotaBox, "bota", settings={"baud": ("baud_code", _baud_code), "boot-s": ("boot_s", _seconds)}, floats=True
+    )
+}

@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 
 from ftmocks.arrays import Array
 from ftmocks.sensors.ati_gauges import REFERENCE, Scale
+from ftmocks.sensors.kind import Kind
 from ftmocks.wires.device import Device
 
 RDT_PORT = 49152
@@ -414,3 +415,23 @@ class _HttpHandler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: object) -> None:
         """Log nothing."""
+
+
+def _numbers(text: str) -> list[float]:
+    numbers = [float(part) for part in text.split(",")]
+    if len(numbers) != 6 or not np.isfinite(numbers).all():
+        raise ValueError(f"expected 6 numbers separated by commas, got {text!r}")
+    return numbers
+
+
+KINDS = {
+    "netft": Kind(
+        NetFtBox,
+        "ati-netft",
+        options={"rdt_port": 0, "rate_hz": 1000},
+        settings={"tool-transform": ("tool_transform", _numbers), "bias": ("bias", _numbers)},
+        at_host=True,
+        # A real sensor has a bias of (15.4, -12.2, -1.7) N and (-1.2, -2.1, 0.05) N·m: philip-long/FoamCutting_kukalwr.
+        bias_scale=(1.1, 2.1),
+    )
+}

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftmocks.arrays import Array
+from ftmocks.sensors.kind import Kind
 from ftmocks.wires import modbus
 from ftmocks.wires.stream import ModbusSensor
 
@@ -132,3 +133,9 @@ class RobotiqBox(ModbusSensor):
 
     def _samples(self, count: int) -> list[bytes]:
         return [stream_frame(raw) for raw in self._raw(count).tolist()]
+
+
+BIAS_SCALE = (3.3, 1.2)
+"""One at rest reads (-20.7, 22.0, -48.7) N and (-0.10, 1.17, -0.32) N·m: ros-industrial-attic/robotiq, request 215."""
+
+KINDS = {"robotiq": Kind(RobotiqBox, "robotiq-ft300", bias_scale=BIAS_SCALE)}

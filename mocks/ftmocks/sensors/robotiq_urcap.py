@@ -16,7 +16,8 @@ import socket
 from dataclasses import dataclass
 from typing import TypedDict
 
-from ftmocks.sensors.robotiq import COUNTS_PER_SI, STREAM_HZ, raw_values
+from ftmocks.sensors.kind import Kind
+from ftmocks.sensors.robotiq import BIAS_SCALE, COUNTS_PER_SI, STREAM_HZ, raw_values
 from ftmocks.wires.device import Device
 
 PORT = 63351
@@ -109,3 +110,6 @@ def _sent(client: socket.socket, rest: bytes, frame: bytes) -> bytes:
             rest = rest[client.send(rest) :]
         return frame[client.send(frame) :]
     return rest
+
+
+KINDS = {"robotiq-urcap": Kind(RobotiqUrcap, "robotiq-ft300", at_host=True, bias_scale=BIAS_SCALE)}

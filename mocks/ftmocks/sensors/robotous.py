@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftmocks.arrays import Array
+from ftmocks.sensors.kind import Kind
 from ftmocks.wires.faults import Frame
 from ftmocks.wires.pty import PtyDevice
 from ftmocks.wires.slcan import CanFrame
@@ -326,3 +327,34 @@ class RobotousSerialBox(RobotousSensor[bytes], SerialSensor):
 
     def _samples(self, count: int) -> list[bytes]:
         return [packet(field) for field in self.samples(count)]
+
+
+def _identifiers(text: str) -> tuple[int, ...]:
+    numbers = tuple(int(part, 0) for part in text.split(","))
+    if len(set(numbers)) != 3 or not all(0 <= number < 0x800 for number in numbers):
+        raise ValueError(f"expected 3 different CAN identifiers from 0 to 0x7FF, got {text!r}")
+    return numbers
+
+
+def _model(name: str) -> Model:
+    if name not in MODELS:
+        raise ValueError(f"unknown model {name!r}; known: {', '.join(MODELS)}")
+    return MODELS[name]
+
+
+KINDS = {
+    "robotous-can": Kind(
+        RobotousCanNode,
+        "robotous-can",
+        "interface=slcan&rate=1000",
+        {"interface": "slcan", "bitrate": 1_000_000},
+        settings={"model": ("model", _model), "ids": ("ids", _identifiers)},
+    ),
+    "robotous-serial": Kind(
+        RobotousSerialBox,
+        "robotous-serial",
+        "baud=115200&rate=200",
+        {"baud": 115_200},
+        settings={"model": ("model", _model)},
+    ),
+}

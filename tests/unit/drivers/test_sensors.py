@@ -1,6 +1,8 @@
 """Every sensor has what docs/how-to/add-a-sensor.md asks for; what is missing is named."""
 
+import re
 from collections.abc import Iterator
+from fnmatch import fnmatch
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -35,16 +37,19 @@ def missing(scheme: str, kind: SensorKind) -> Iterator[str]:
         yield "drivers/ftdrivers/sensors.py: the names of its emulators"
     for emulator in kind.emulated:
         if SCHEMES.get(emulator) != scheme:
-            yield f"mocks/ftmocks/sensors/catalogue.py: the emulator {emulator}"
+            yield f"mocks/ftmocks/sensors: the emulator {emulator}, in KINDS of its module"
     if scheme not in {row.scheme for row in ROWS.values()} and kind.wire != "topic":
         yield "tests/wire/sensor_kinds.py: a row, which runs the tests of every driver"
-    if f"| `{scheme}:" not in (ROOT / "docs/reference/sensors.md").read_text(encoding="utf-8"):
+    page = (ROOT / "docs/reference/sensors.md").read_text(encoding="utf-8")
+    if f"| `{scheme}:" not in page:
         yield "docs/reference/sensors.md: a row with its address"
+    if not any(fnmatch(scheme, row) for row in re.findall(r"^\| `([\w*-]+)` \|", page, re.MULTILINE)):
+        yield "docs/reference/sensors.md: a row with what it reports about itself"
 
 
 @pytest.mark.parametrize("scheme", SENSORS)
 def test_a_sensor_has_all_that_it_needs(scheme: str) -> None:
-    assert list(missing(scheme, SENSORS[scheme])) == []
+    assert not (lines := list(missing(scheme, SENSORS[scheme]))), "\n".join(lines)
 
 
 def test_every_emulated_sensor_has_a_driver() -> None:
