@@ -22,7 +22,7 @@ CEILINGS = {
     "dataclasses": 229,
     "public functions and classes": 1414,
     "import statements inside functions": 108,
-    "test lines": 59999,
+    "test lines": 59991,
 }
 ROOMS = {
     "a: calibrate, to the first move": 70,

@@ -136,6 +136,7 @@ def test_back_and_the_summary_change_answers() -> None:
     assert cell.workcell.boxes_mm == ()
 
 
+@pytest.mark.slow
 def test_an_arm_without_a_measured_shape_is_reported(addresses: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(SHAPES, "UR5e")
     outcome = run(*addresses, *TOOL, "--yes")
@@ -152,6 +153,7 @@ def test_a_bus_is_asked_what_is_there(station: Station) -> None:
     assert load().sensor.url == f"ati-can://{can['channel']}?interface=slcan&bitrate={can['bitrate']}"
 
 
+@pytest.mark.slow
 def test_nothing_counts_as_measured_until_the_operator_sets_it(addresses: list[str]) -> None:
     assert run(*addresses, *TOOL, "--yes").exit_code == 0
     text = Path("ftdrive.toml").read_text()

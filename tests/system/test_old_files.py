@@ -42,6 +42,7 @@ def test_a_recording_has_its_samples_and_its_calibration(old: CommandLine, name:
     assert np.isfinite(recording.rows["wrench"]).all()
 
 
+@pytest.mark.slow
 def test_the_matrix_of_the_sensor_the_plan_and_the_store_are_read(old: CommandLine) -> None:
     error = SensorMatrix.load(old.folder / "sensor.json").error
     assert 0 < np.abs(error.diagonal()).max() < 0.05

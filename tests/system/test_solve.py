@@ -36,6 +36,7 @@ def rows(n: int) -> list[str]:
     return lines
 
 
+@pytest.mark.slow
 def test_real_recording_gives_the_published_result(solve: Solve, real_data: Path) -> None:
     folder = real_data / "agimus_mini45_b"
     outcome = solve(folder / "poses.csv", "--orientation", "R_flange_base", "--json")
@@ -49,6 +50,7 @@ def test_real_recording_gives_the_published_result(solve: Solve, real_data: Path
     assert result["residual"]["torque_rms_Nm"] <= 0.007
 
 
+@pytest.mark.slow
 def test_a_drifting_recording_is_rejected(solve: Solve, real_data: Path) -> None:
     outcome = solve(real_data / "foamcutting_2013_06_12" / "poses.csv", "--orientation", "R_flange_base", "--json")
     assert outcome.returncode == 7
@@ -81,6 +83,7 @@ def test_several_files_give_a_line_each_and_one_bad_file_does_not_hide_the_other
     assert answers[1]["mass_kg"] == answers[2]["mass_kg"]
 
 
+@pytest.mark.slow
 def test_a_rejected_result_is_saved_only_by_force_and_stays_marked(solve: Solve, tmp_path: Path) -> None:
     path, output = tmp_path / "poses.csv", tmp_path / "calibration.json"
     rng = np.random.default_rng(1)
@@ -123,6 +126,7 @@ def noisy(lines: list[str]) -> list[str]:
     ]
 
 
+@pytest.mark.slow
 def test_a_new_tool_takes_four_poses_and_two_runs_are_one(solve: Solve, tmp_path: Path) -> None:
     every = rows(24)
     for name, some in (("all", every[:16]), ("four", every[16:20]), ("more", every[16:])):

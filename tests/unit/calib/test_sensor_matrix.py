@@ -95,6 +95,7 @@ def test_a_calibration_of_the_loads_has_the_rotation_of_their_fit() -> None:
         np.testing.assert_allclose(np.sqrt(np.diag(other)[:3]), [0.2, 0.2, 0], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_result_knows_whether_its_poses_are_of_the_loads() -> None:
     result = solved()
     own = {"datasets": ["0", result.provenance["dataset_sha256"]]}

@@ -87,6 +87,7 @@ def test_yu_table_1_is_exact_without_noise(method: Method, measured: bool, setup
     assert np.abs(error).max() < 2e-12  # 1.0e-12 with NumPy 2.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("orientations", "seed", "runs"),
     [
@@ -237,6 +238,7 @@ def test_published_methods_are_good_without_noise(method: Method, as_published: 
     assert CalibrationResult.from_dict(document).to_dict() == document
 
 
+@pytest.mark.slow
 def test_carlsons_printed_form_is_judged_by_the_bias_that_it_leaves_out() -> None:
     data = dataset(R48, noisy(np.random.default_rng(2), R48, white(48)), white(48))
     assert solve(data, "carlson-nullspace").verdict == "good"
@@ -313,6 +315,7 @@ def test_deviations_from_the_special_orientations_are_named_with_their_error(met
             assert note.values["force_N"] == pytest.approx(np.linalg.norm(without_noise), rel=0.5)
 
 
+@pytest.mark.slow
 def test_the_sigma_of_srom_includes_the_deviation_of_its_orientations(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = 6
     monkeypatch.setattr("ftcalib.solver.SIMULATIONS", 50)
@@ -328,6 +331,7 @@ def test_the_sigma_of_srom_includes_the_deviation_of_its_orientations(monkeypatc
     assert (rms < 1.3).all()
 
 
+@pytest.mark.slow
 def test_knowledge_makes_poor_poses_enough() -> None:
     R = spin("z", 150.0)
     wrench = noisy(np.random.default_rng(12), R, white(8))
@@ -418,6 +422,7 @@ def real(name: str) -> CalibrationDataset:
     return read_dataset(Path(folder) / name / "poses.csv", "R_flange_base")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["ml", "lrom"])
 def test_a_real_session_gives_the_published_answer(method: Method) -> None:
     result = solve(real("agimus_mini45_b"), method)
@@ -456,6 +461,7 @@ def test_a_real_session_with_drift_is_not_called_good() -> None:
     assert abs(result.mass_kg - 0.470) < 2.5 * result.sigma["mass_kg"]
 
 
+@pytest.mark.slow
 def test_a_sensor_with_an_arbitrary_zero_may_have_any_bias() -> None:
     truth = Parameters(
         np.eye(3), np.array([0, 0, -9.0]), np.array([0, 0, 25_400.0]), np.array([0, 0, 0.1]), np.zeros(3)

@@ -275,6 +275,7 @@ def test_a_class_that_is_no_driver_is_named(install: Install) -> None:
         sensor_from_url("odd://x")
 
 
+@pytest.mark.slow
 def test_doctor_asks_the_arm_of_another_package_only_what_any_arm_knows(install: Install, tmp_path: Path) -> None:
     points = "[ftdrive.sensors]\nacme-usb = acme_arm:Sensor\n[ftdrive.arms]\nacme = acme_arm:Arm\n"
     install("acme_arm", points, ACME)

@@ -65,6 +65,7 @@ def test_a_turning_joint_makes_a_ripple_as_large_as_that_of_a_real_arm() -> None
     assert not ripple[ENDED].any()
 
 
+@pytest.mark.slow
 def test_a_ringing_link_is_a_damped_mass_on_a_spring() -> None:
     """Against steps of 20 µs; half a cycle later it is where the next would have it."""
     rng = np.random.default_rng(0)

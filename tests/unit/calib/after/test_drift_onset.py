@@ -30,6 +30,7 @@ def ramp(t: Array, onset: float, a_week: float) -> Array:
 DAILY = np.arange(90.0) + 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("a_week", [1.0, -3.0])
 def test_a_drift_is_found_within_three_weeks_with_its_rate_and_onset(a_week: float) -> None:
     """1 sigma a week in 19 of 20 series; docs/contributing/figures/fleet.md has the figures."""
@@ -60,6 +61,7 @@ def test_an_offset_of_an_old_calibration_is_no_slow_drift_since_then() -> None:
         assert not searched(DAILY + 200, series(DAILY, seed) + 2.5 * np.eye(6)[seed % 6]).found.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [10.0, 300.0])
 def test_a_tare_is_no_drift_on_any_day_after_it(size: float) -> None:
     for seed in range(4):

@@ -4,15 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
-from ftcalib.after.new_tool import _beyond, new_tool, together
-from ftcalib.data.dataset import pooled_covariance
+from ftcalib.after.new_tool import new_tool, together
 from ftcalib.errors import NotObservable
 from ftcalib.model import Array, Parameters, predict
-from ftcalib.sensor_matrix import response_columns, sensor_error_columns
 from tests.first_order import assert_same, propagated
 from tests.unit.ftdrive.stream.simulated import NOISE, TRUTH, calibrated
 
@@ -81,6 +78,7 @@ def test_poses_without_noise_are_refused() -> None:
         new_tool(calibrated(), CalibrationDataset.of(FOUR, predict(OTHER, FOUR)))
 
 
+@pytest.mark.slow
 def test_two_days_with_a_moved_bias_are_one_fit() -> None:
     R = Rotation.random(16, rng=np.random.default_rng(5)).as_matrix()
     moved = replace(TRUTH, force_bias_N=TRUTH.force_bias_N + 2.0, torque_bias_Nm=TRUTH.torque_bias_Nm - 0.05)
@@ -92,37 +90,6 @@ def test_two_days_with_a_moved_bias_are_one_fit() -> None:
     other = replace(moved, p_sensor_com_m=TRUTH.p_sensor_com_m + np.array([0.002, 0, 0]))
     with pytest.raises(NotObservable, match="contradict each other"):
         together([days[0], solve(poses(other, R[8:], 2))])
-
-
-def test_the_covariance_of_a_new_tool_is_that_of_first_order() -> None:
-    """Of readings and sensor, and of mounting and base of the earlier result."""
-    earlier = calibrated(8)
-    root = np.diag(np.repeat([3e-3, 0.03, 0.02, 1e-3, 1e-3], 3)) @ (
-        np.eye(15) + 0.3 * np.random.default_rng(7).normal(size=(15, 15))
-    )
-    C = root @ root.T
-    earlier = replace(earlier, covariance=C, response=None)
-    R = FOUR
-    p = earlier.parameters
-    now = replace(OTHER, R_flange_sensor=p.R_flange_sensor, gravity_force_base_N=0.6 * p.gravity_force_base_N)
-    y = predict(now, R)
-    dataset = replace(poses(now, R, 0), wrench=y)
-    assert dataset.wrench_cov is not None
-    noise = block_diag(*(pooled_covariance(dataset.wrench_cov, dataset.n_samples) + np.diag(_beyond(earlier, now))))
-    known = earlier.shown_response
-    assert known is not None
-    unseen = response_columns(now, R) * np.sqrt(np.diag(known.covariance)[15:])
-    sensor = np.concatenate([sensor_error_columns(p, known, now, R), unseen], axis=-1).reshape(24, -1)
-
-    def solved(e: Array, shift: Array) -> Array:
-        new = new_tool(replace(earlier, parameters=p.moved(e)), replace(dataset, wrench=y + shift.reshape(4, 6)))
-        return np.asarray(now.difference(new.parameters))
-
-    found = new_tool(earlier, dataset)
-    expected = propagated(lambda e: solved(e, np.zeros(24)), C) + propagated(
-        lambda e: solved(np.zeros(15), e), noise + sensor @ sensor.T
-    )
-    assert_same(found.covariance, expected, 5e-3)
 
 
 def test_the_covariance_of_runs_together_is_that_of_first_order() -> None:

@@ -86,6 +86,7 @@ def test_a_solved_calibration_can_be_updated() -> None:
     assert tare(result, R[:1], [dwell(truth(), R[0], rng)]).covariance.shape == (15, 15)
 
 
+@pytest.mark.slow
 def test_the_covariance_of_a_tare_covers_noise_and_the_old_errors() -> None:
     rng = np.random.default_rng(5)
     R = tilted(20, 70)

@@ -156,6 +156,7 @@ def inexact(poses: int, seed: int) -> tuple[CalibrationDataset, Array, Array]:
     return fitted, orientations(6, seed), parts[1]
 
 
+@pytest.mark.slow
 def test_hysteresis_is_no_false_alarm_and_hides_no_change() -> None:
     R, new = special(range(1, 25)), orientations(6)
     lag = 0.002

@@ -129,6 +129,7 @@ def moved(known: Calibrated, error: Array) -> Calibrated:
     return Calibrated(known.parameters.moved(error[:15]), C[:15, :15], response)
 
 
+@pytest.mark.slow
 def test_the_covariance_has_all_errors_of_readings_and_calibration() -> None:
     gripper, (tool, C, response) = Gripper(5), rough()
     reference = Calibrated(tool, C[:15, :15], response)

@@ -116,6 +116,7 @@ def test_rounded_rotations_are_put_back_onto_so3(decimals: int) -> None:
     assert np.abs(data.R_base_flange - exact).max() < 10.0**-decimals
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.integers(3, 17))
 def test_a_file_gives_back_the_same_numbers(

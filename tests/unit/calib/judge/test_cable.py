@@ -31,6 +31,7 @@ def calibrated(stiffness_Nm: Array, seed: int, *, measured: bool = True) -> Cali
     return solve(CalibrationDataset(R, wrench, cov, np.full(24, 500 if measured else 0), np.arange(24.0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measured", [True, False])
 def test_sigma_of_the_centre_of_mass_allows_for_a_cable(measured: bool) -> None:
     result = calibrated(np.array([[0.02, 0, 0.01], [0, 0.02, 0], [0, 0.005, 0.02]]), 1, measured=measured)
@@ -49,6 +50,7 @@ def test_white_noise_shows_no_cable() -> None:
         assert calibrated(np.zeros((3, 3)), seed).cable_shift is None
 
 
+@pytest.mark.slow
 def test_a_file_has_it_and_may_lack_it() -> None:
     result = calibrated(0.02 * np.eye(3), 3)
     document = result.to_dict()

@@ -233,6 +233,7 @@ def test_reversed_torques_come_before_what_they_put_outside() -> None:
     assert (result.verdict, codes(result)) == ("usable", ["torques_reversed"])
 
 
+@pytest.mark.slow
 def test_torques_about_the_tcp_are_not_only_called_reversed() -> None:
     """The tool is too short for a centre of mass that reversed torques would have 90 mm from the sensor."""
     data = session()

@@ -68,6 +68,7 @@ def test_any_order_of_euler_angles_is_named_from_the_one_that_was_read(written: 
         assert said == [("euler_angles", written, spelled)] * (written != read)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["matrix", "quaternion", "vector", "joints", "xyz"])
 def test_a_hypothesis_names_only_what_the_file_can_contain(form: str) -> None:
     _, R, wrench = session(1)
@@ -123,6 +124,7 @@ def test_a_channel_of_a_few_decimal_steps_is_not_saturated() -> None:
     assert "saturated" not in {one.code for one in broken_channels(np.round(wrench, 3), R)}
 
 
+@pytest.mark.slow
 def test_columns_of_force_and_torque_that_were_exchanged_are_named() -> None:
     _, R, wrench = session(1)
     assert first(R, np.roll(wrench, 3, axis=1)).code == "columns_swapped"
@@ -140,6 +142,7 @@ def test_coarse_and_saturated_readings_are_named() -> None:
     assert (saturated.code, saturated.values["channel"], saturated.values["poses"]) == ("saturated", "fx", rows)
 
 
+@pytest.mark.slow
 def test_a_wrench_that_is_compensated_already_has_no_weight() -> None:
     p, R, wrench = session(1)
     left = wrench - 0.99 * (predict(p, R) - np.concatenate([p.force_bias_N, p.torque_bias_Nm]))
@@ -191,6 +194,7 @@ def test_orientations_in_left_handed_axes_are_named() -> None:
     assert first(SWAP @ R @ SWAP, wrench).code == "forces_reversed"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("Q", "group"), [(SWAP, "torque"), (CYCLE, "force")])
 def test_axes_that_disagree_are_named_with_their_order(Q: Array, group: str) -> None:
     _, R, wrench = session(4)
@@ -215,6 +219,7 @@ def test_a_mistake_is_named_before_known_values_that_it_contradicts() -> None:
     assert first(np.swapaxes(R, 1, 2), wrench, known).code == "orientations_inverted"
 
 
+@pytest.mark.slow
 def test_a_wrench_in_base_axes_is_named() -> None:
     p, R, wrench = session(5)
     turned = R @ p.R_flange_sensor
@@ -242,6 +247,7 @@ def test_a_channel_that_is_stuck_and_rows_that_were_copied_are_named() -> None:
 LBF_N, KGF_N, LBF_IN_NM = 4.4482216, 9.80665, 0.11298483
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("force", "torque", "units"),
     [

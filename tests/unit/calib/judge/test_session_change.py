@@ -72,6 +72,7 @@ def sigmas(result: CalibrationResult, truth: Parameters) -> Array:
     return np.asarray(result.parameters.difference(truth) / np.sqrt(np.diag(result.covariance)))
 
 
+@pytest.mark.slow
 def test_poses_of_two_loads_are_refused() -> None:
     result = session(LIGHTER, 21, seed=21)
     first = result.findings[0]
@@ -79,6 +80,7 @@ def test_poses_of_two_loads_are_refused() -> None:
     assert first.values["change_N"] == pytest.approx(-0.36, abs=0.01)
 
 
+@pytest.mark.slow
 def test_poses_count_as_they_were_taken_not_as_they_stand() -> None:
     rows = np.random.default_rng(3).permutation(24)
     result = session(LIGHTER, 12, seed=2, rows=rows)
@@ -95,6 +97,7 @@ def test_other_changes_are_named_before_the_drift_that_they_look_like(after: Par
     assert (result.verdict == "rejected") == (code != "bias_stepped")
 
 
+@pytest.mark.slow
 def test_a_tool_that_turns_with_its_sensor_is_named_with_its_angle() -> None:
     axis = np.random.default_rng(0).normal(size=3)
     turn = Rotation.from_rotvec(axis / np.linalg.norm(axis), degrees=True).as_matrix()
@@ -109,6 +112,7 @@ def test_rows_of_two_sensors_are_named() -> None:
     assert session(OTHER, slice(1, None, 2), seed=1).findings[0].code == "sensors_alternate"
 
 
+@pytest.mark.slow
 def test_a_run_that_was_tared_is_not_refused() -> None:
     result = session(TARED, 12, seed=0)
     assert result.verdict == "usable"
@@ -200,6 +204,7 @@ def all_disturbances(seed: int, turn_deg: float) -> CalibrationResult:
     return solve(CalibrationDataset.of(flange(q), samples.mean(axis=1), t_s=t_s))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3005, *(pytest.param(k, marks=pytest.mark.slow) for k in (3006, 3012))])
 def test_a_turn_by_a_degree_is_named_beside_errors_that_have_a_structure(seed: int) -> None:
     first = all_disturbances(seed, 1.0).findings[0]
@@ -207,6 +212,7 @@ def test_a_turn_by_a_degree_is_named_beside_errors_that_have_a_structure(seed: i
     assert first.values["turn_deg"] == pytest.approx(1.0, abs=0.6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [4005, *(pytest.param(k, marks=pytest.mark.slow) for k in (4008, 4009))])
 def test_errors_that_have_a_structure_are_no_change(seed: int) -> None:
     named = {one.code for one in all_disturbances(seed, 0.0).findings}

@@ -109,6 +109,7 @@ def test_statistics_give_the_normal_equations_of_the_data() -> None:
 # Basins
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "degrees", "weight_in_sigma"), [(6, 180, 10), (12, 40, 30)])
 def test_no_start_reaches_a_lower_minimum(n: int, degrees: float, weight_in_sigma: float) -> None:
     sigma = SIGMA * 100 / weight_in_sigma
@@ -146,6 +147,7 @@ def test_the_odds_of_the_second_basin_are_those_of_being_wrong() -> None:
 # What is not sensor noise
 
 
+@pytest.mark.slow
 def test_bumped_poses_are_rejected_and_no_others() -> None:
     rng, n, bumped = np.random.default_rng(0), 12, 3
     p, R = truth(rng), haar(rng, n)

@@ -74,6 +74,7 @@ def test_right_rows_have_no_mistake_and_stay_as_they_are() -> None:
     assert undone(rows) is rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("offset_m", "turn_rad"),
     [
@@ -92,6 +93,7 @@ def test_poses_of_a_tcp_are_named_with_the_place_of_the_sensor(
     np.testing.assert_allclose(one.values["point_mm"], 1e3 * expected, atol=4)
 
 
+@pytest.mark.slow
 def test_a_sensor_a_little_beside_the_flange_axis_limits_and_is_fitted() -> None:
     rows = of_point(RIGHT, np.array([0.02, 0, 0]), np.zeros(3))
     assert [(one.code, one.severity) for one in found(rows)] == [("poses_of_tcp", "limit")]
@@ -124,6 +126,7 @@ def test_torques_about_a_tcp_are_not_taken_for_reversed_ones(point_m: tuple[floa
     np.testing.assert_allclose(one.values["point_mm"], 1e3 * expected, atol=7)  # a bias of 9 N has moved too
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.9, 2.0])
 def test_a_wrong_clock_is_named_with_its_factor(factor: float) -> None:
     rows = with_motion(RIGHT, factor**2, factor**2)
@@ -141,6 +144,7 @@ def test_positions_in_another_unit_are_named() -> None:
     assert (one.code, one.values["unit"]) == ("positions_unit", "mm")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("signs", "channels"), [((-1, -1), "forces and torques"), ((1, -1), "torques")])
 def test_reversed_channels_are_named_and_turned_back(signs: tuple[int, int], channels: str) -> None:
     rows = replace(RIGHT, wrench=RIGHT.wrench * np.repeat(signs, 3))

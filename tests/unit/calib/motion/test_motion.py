@@ -164,6 +164,7 @@ def test_a_motion_about_one_axis_determines_nothing() -> None:
         solve_motion(*means_of(record(TRUTH, sweep(6.0, (0, 0, 1.5)), 6.0, 1)))
 
 
+@pytest.mark.slow
 def test_known_values_determine_what_the_motion_does_not() -> None:
     about_one_axis = record(TRUTH, sweep(SWEEP_S, (0.0, 1.3, 0.0)), SWEEP_S, 1)
     known = Known(R_flange_sensor=TRUTH.R_flange_sensor, gravity_direction_base=TRUTH.gravity_m_s2)

@@ -74,6 +74,7 @@ def about_one_axis() -> MotionRows:
     return replace(rows, motion=replace(rows.motion, R_base_flange=spin.as_matrix()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("place", "sigma", "enough"), [(2, 0.29, True), (2, 0.31, False), (4, 0.51, False)])
 def test_a_fit_with_large_errors_is_not_determined(place: int, sigma: float, enough: bool) -> None:
     covariance = np.zeros((SIZE, SIZE))

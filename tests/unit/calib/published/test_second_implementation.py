@@ -146,6 +146,7 @@ def test_both_agree_in_a_turned_base_that_the_arm_misses_by_half_a_degree(method
     _assert_equal(ours, Parameters(R.T, Y @ F_b, *others))
 
 
+@pytest.mark.slow
 def test_both_see_that_a_bias_keeps_algorithm_1_as_printed_from_converging(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ftcalib.published.carlson.MOST_ITERATIONS", 2000)
     method = "carlson-iterative"

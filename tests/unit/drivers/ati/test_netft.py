@@ -236,6 +236,7 @@ def test_tool_transformation_that_cannot_be_undone_is_refused(page: bytes) -> No
         box.sensor().open()
 
 
+@pytest.mark.slow
 def test_silence_ends_the_stream() -> None:
     with Box() as box, box.sensor() as sensor:
         box.mute = True
@@ -246,6 +247,7 @@ def test_silence_ends_the_stream() -> None:
         assert 0.3 <= box.time.of_drivers.now_s() - heard_s < 30
 
 
+@pytest.mark.slow
 def test_what_was_thrown_away_is_counted_since_open() -> None:
     with Box(*map(record, [1, 2, 2, 3, 5, 4, 6]), RECORD[:-1]) as box:
         sensor = box.sensor()

@@ -174,6 +174,7 @@ def test_an_address_that_cannot_be_used_is_one_sentence(words: str, host: str, u
         Ros2Arm(host.format(urdf=urdf, broken=broken, planar=planar))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bias_N", [0.0, 7.0])
 def test_a_compensated_wrench_at_rest_is_named_and_never_good(bias_N: float) -> None:
     cell: Any = SimpleNamespace(tool=SimpleNamespace(mass_kg=1.3), site=SimpleNamespace(g_m_s2=9.80665))

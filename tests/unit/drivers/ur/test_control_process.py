@@ -88,6 +88,7 @@ class RTDEControlInterface:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("host", "starting_s", "leaving_s"), [("hangs", "0.2", "60"), ("answers", "60", "0.2")])
 def test_a_library_that_hangs_does_not_keep_its_process(
     host: str, starting_s: str, leaving_s: str, tmp_path: Path

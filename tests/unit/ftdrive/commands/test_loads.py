@@ -72,6 +72,7 @@ def test_a_matrix_is_saved_beside_the_cell_and_used_for_its_sensor_alone(sensor:
     assert "sensor FT1" in run("show").output
 
 
+@pytest.mark.slow
 def test_later_loads_begin_with_the_earlier_matrix_and_can_be_dropped(sensor: LoadedSensor) -> None:
     save(sensor.runs(PROTOCOLS["hung, tip"]))
     assert run("solve", "tool.json", "tip.json").exception is None
@@ -133,6 +134,7 @@ def test_an_emulated_cell_hangs_the_load_itself_also_without_a_place(monkeypatch
     assert [(one["do"], one["mass_kg"], one["at_mm"]) for one in hung] == [("hang", 1.0, (0.0, 0.0, 200.0))]
 
 
+@pytest.mark.slow
 def test_a_load_that_hangs_nowhere_is_named_after_an_unsteady_second(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = np.zeros(6)
     touched = [(POSE, sign * part(POSE, 0.2)) for sign in (1, -1)]

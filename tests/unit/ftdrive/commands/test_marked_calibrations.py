@@ -48,6 +48,7 @@ USES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", USES)
 def test_an_edited_calibration_is_refused_unless_it_is_forced_and_then_marked(
     name: str, run: Callable[..., Ran]

@@ -206,6 +206,7 @@ def test_compensate_answers_as_documented(recorded: Path, capsys: pytest.Capture
     assert str(load_recording(Path("b.parquet")).header.frame) == "base axes, about the sensor origin"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "ending"),
     [
@@ -345,6 +346,7 @@ def test_compensate_refuses_the_calibration_of_another_sensor(
     assert "FT9" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_live_replays_a_recording_with_its_calibration_or_another(
     recorded: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -40,6 +40,7 @@ def near(one: np.ndarray, other: np.ndarray) -> None:
     np.testing.assert_allclose(one, other, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_columns_may_be_named_on_the_line_and_in_a_file(solved: Solved) -> None:
     renamed = {f"c {i}": values for i, values in enumerate(PLAIN.values())}
     names = {name: f"c {i}" for i, name in enumerate(PLAIN)}
@@ -53,6 +54,7 @@ def test_columns_may_be_named_on_the_line_and_in_a_file(solved: Solved) -> None:
     near(parameters(solved(renamed, "--columns", "columns.toml")), expected)
 
 
+@pytest.mark.slow
 def test_a_unit_may_have_a_size(solved: Solved) -> None:
     scaled = PLAIN | {name: values / 0.82 for name, values in wrench(POSES).items() if name.startswith("f")}
     near(
@@ -100,6 +102,7 @@ def test_an_option_that_cannot_be_used_is_one_sentence(options: list[str], words
     assert err.count("error:") + err.count("Error:") == 1
 
 
+@pytest.mark.slow
 def test_options_of_a_table_do_not_go_with_other_data(solved: Solved) -> None:
     near(parameters(solved(PLAIN)), parameters(solved(PLAIN, "--rate", "1")))  # poses have their times in any case
     from ftdrive import read_dataset

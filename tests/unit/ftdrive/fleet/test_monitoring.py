@@ -40,6 +40,7 @@ def expressions() -> Iterator[str]:
         yield from (target["expr"].replace("$cell", ".*") for target in panel["targets"])
 
 
+@pytest.mark.slow
 def test_the_rules_are_valid_and_fire_when_they_should(promtool: str) -> None:
     assert "6 rules found" in run(promtool, "check", "rules", ALERTS)
     assert "SUCCESS" in run(promtool, "test", "rules", Path(__file__).with_name("alerts_test.yml"))

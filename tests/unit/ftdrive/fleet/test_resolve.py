@@ -29,6 +29,7 @@ def again(*folders: Path, submit: Any = at_once) -> dict[Path, Comparison | str]
     return dict(solve_again(folders, Workers(1, submit, BrokenExecutor)))
 
 
+@pytest.mark.slow
 def test_the_result_is_that_of_the_run_and_replaces_nothing(tmp_path: Path) -> None:
     folder = calibrated_run(tmp_path, "run")
     before = (folder / "calibration.json").read_bytes()

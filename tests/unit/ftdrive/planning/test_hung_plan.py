@@ -59,12 +59,6 @@ def test_the_tilts_are_reached_from_those_about_another_hook() -> None:
     assert plan_approach(certifier().without_load, q_rad, tilts_rad[0], Speeds()).certified
 
 
-def test_the_moves_are_slow() -> None:
-    fastest = Speeds.with_hung_load()
-    assert plan().top_speed_rad_s <= fastest.joint_rad_s + 1e-9
-    assert plan().acceleration_rad_s2 <= fastest.joint_rad_s2
-
-
 @pytest.mark.slow
 def test_the_plan_is_proven_with_its_load() -> None:
     plan().require(certifier())

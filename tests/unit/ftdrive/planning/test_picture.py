@@ -53,6 +53,7 @@ def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, mon
     assert ("WHOLE ARM moves" in saved[2].get_suptitle()) > ("WHOLE ARM" in titles[0])
 
 
+@pytest.mark.slow
 def test_a_picture_is_never_overwritten(plan: Plan, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib.figure")
     (path := tmp_path / "plan.png").touch()

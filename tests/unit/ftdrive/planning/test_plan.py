@@ -49,6 +49,7 @@ def usual(poses: int = 24) -> Plan:
     return planned(certifier_of(), poses=poses)
 
 
+@pytest.mark.slow
 def test_poses_of_a_new_tool_spread_gravity_like_a_tetrahedron(monkeypatch: pytest.MonkeyPatch) -> None:
     certifier = certifier_of()
     plan = plan_for(CELL, certifier, USUAL_POSTURE_RAD, TOOL_POSES)
@@ -74,6 +75,7 @@ def test_another_posture_is_proposed_where_the_arm_stands_badly() -> None:
     plan.require(certifier)
 
 
+@pytest.mark.slow
 def test_no_room_at_all_is_refused_in_a_sentence() -> None:
     ceiling = Plane((0.0, 0.0, -1.0), -0.3)
     certifier = certifier_of(scene=Scene(planes=(*Scene().planes, ceiling)))
@@ -81,6 +83,7 @@ def test_no_room_at_all_is_refused_in_a_sentence() -> None:
         planned(certifier, poses=6)
 
 
+@pytest.mark.slow
 def test_plan_is_deterministic_and_comes_back_from_its_file(tmp_path: Path) -> None:
     certifier = certifier_of(scene=Scene(boxes=(Box((0.6, 0.6, 0.0), (0.8, 0.8, 0.2)),)))
     plan = planned(certifier, poses=6)
@@ -137,6 +140,7 @@ def test_a_plan_of_version_1_is_read_and_proven_for_this_arm(tmp_path: Path) -> 
     assert Plan.load(again).of_arm(certifier).sha256 == plan.sha256
 
 
+@pytest.mark.slow
 def test_a_plan_that_only_another_arm_has_room_for_is_refused() -> None:
     """A wall as near as the margin allows to the arm that the plan was made for is too near for another one."""
     one, other = MODELS["UR5e"], drawn("UR5e")

@@ -40,6 +40,7 @@ def test_one_pose_is_too_few() -> None:
         plan(1)
 
 
+@pytest.mark.slow
 def test_another_posture_is_found_and_named() -> None:
     ceiling = Plane((0.0, 0.0, -1.0), -0.75)
     made = plan(6, Certifier(CERTIFIER.arm, Scene((BASE_PLANE, ceiling))))

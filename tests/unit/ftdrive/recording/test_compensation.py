@@ -156,6 +156,7 @@ def write_pair(folder: Path, delay_s: float, orientation: str) -> tuple[Path, Pa
     return wrench, poses
 
 
+@pytest.mark.slow
 def test_a_pair_of_files_is_paired_with_its_delay_despite_a_push(tmp_path: Path) -> None:
     files = write_pair(tmp_path, 0.012, "rx,ry,rz")
     found = TablePair(Table(files[0]), Table(files[1]), calibration(), "c", None)
@@ -168,6 +169,7 @@ def test_a_pair_of_files_is_paired_with_its_delay_despite_a_push(tmp_path: Path)
     assert compensate_recording(fixed, WrenchFrame())[0]["compensated"]["torque_rms_Nm"] > 1.5 * rms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damaged", ["wrench.csv", "poses.csv"])
 def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
     damaged: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

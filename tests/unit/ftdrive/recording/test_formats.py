@@ -105,6 +105,7 @@ def test_a_file_of_another_version_lacks_stages_that_were_off_and_may_have_one_t
         next_header(header, StreamEvent(0, "stages", "", newer))
 
 
+@pytest.mark.slow
 def test_conversion_is_lossless(paths: Sequence[Path], tmp_path: Path) -> None:
     first, path = load_recording(paths[0]), paths[0]
     for name in ("a.csv", "b.parquet", "c.mcap"):
@@ -115,6 +116,7 @@ def test_conversion_is_lossless(paths: Sequence[Path], tmp_path: Path) -> None:
     assert path.read_bytes() == (tmp_path / "d.mcap").read_bytes()  # messages name the frame of their samples too
 
 
+@pytest.mark.slow
 def test_rosbags_reads_the_messages(paths: Sequence[Path]) -> None:
     rows, frames = load_recording(paths[0]).rows, set()
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -181,6 +183,7 @@ def test_a_plain_reader_of_the_format_finds_no_fault(paths: Sequence[Path]) -> N
     assert kinds[-1] == "Footer"
 
 
+@pytest.mark.slow
 def test_a_file_that_another_program_has_divided_otherwise_is_read(paths: Sequence[Path], tmp_path: Path) -> None:
     with paths[0].open("rb") as file, (tmp_path / "other.mcap").open("wb") as new:
         writer = Writer(new, chunk_size=20_000)
@@ -233,6 +236,7 @@ def test_a_file_cut_anywhere_is_read_up_to_there_or_rejected(
     assert len(set(lengths)) >= least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_flipped_bit_is_refused_or_changes_no_number(small: Sequence[Path], ending: str, tmp_path: Path) -> None:
     path = small[ENDINGS.index(ending)]
@@ -296,6 +300,7 @@ def test_parquet_of_the_writer_before_pyarrow_is_read_and_has_the_same_columns(
     assert {b"header", b"events"} < parquet.read_metadata(small[2]).metadata.keys()
 
 
+@pytest.mark.slow
 def test_parquet_that_pyarrow_has_copied_stays_a_recording_and_other_parquet_is_none(
     paths: Sequence[Path], tmp_path: Path
 ) -> None:

@@ -59,6 +59,7 @@ def facts() -> Mapping[str, Any]:
     return facts_of(replace(subject, parent_name=EVIL))
 
 
+@pytest.mark.slow
 def test_the_head_names_arm_sensor_tool_and_date(monkeypatch: pytest.MonkeyPatch) -> None:
     devices = {"arm": {"model": "UR5e", "serial": "1"}, "sensor": {"model": "Mini45", "serial": "FT9"}}
     known = {"devices": devices, "setup": {"tool": "gripper"}, "created_utc": "2026-11-23T07:58:25+00:00"}
@@ -258,6 +259,7 @@ def command(*arguments: str | Path) -> Any:
     return CliRunner().invoke(cli, ["report", *map(str, arguments)])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_other_methods")
 def test_a_rejected_run_gets_a_report_with_its_reasons(tmp_path: Path) -> None:
     run = recorded(tmp_path, noise=5.0)

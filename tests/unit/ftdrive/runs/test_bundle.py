@@ -91,6 +91,7 @@ def test_no_text_of_a_bundle_has_an_address_or_a_name_and_serial_numbers_stay(ru
     assert json.loads(texts["environment.json"])["packages"]["numpy"] == np.__version__
 
 
+@pytest.mark.slow
 def test_a_bundle_gives_the_result_of_its_run_to_the_last_digit(run: Run, bundled: Path) -> None:
     saved = CalibrationResult.load(run.calibration_path)
     for command in ("replay", "solve"):
@@ -237,6 +238,7 @@ def test_a_bundle_without_end_is_refused(tmp_path: Path, capfd: pytest.CaptureFi
         assert "is a pipe or a device" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_is_refused_or_changes_no_number(run: Run, bundled: Path, tmp_path: Path) -> None:
     path, content = tmp_path / "a.zip", bundled.read_bytes()
     rng, refused = np.random.default_rng(2), 0

@@ -31,6 +31,7 @@ def test_options_describe_one_place() -> None:
             Load.of("2", place, gripped=gripped)
 
 
+@pytest.mark.slow
 def test_a_run_with_a_load_is_not_that_of_its_tool(lab: Lab) -> None:
     load = Load.of("0.5", None, gripped=True)
     run = lab.take_poses(load=load, description={"load": load.to_dict()})

@@ -23,6 +23,7 @@ def recording(n: int = 500, rate_Hz: float = 100.0) -> MotionRecording:
     )
 
 
+@pytest.mark.slow
 def test_no_single_bit_of_its_headers_can_end_in_another_error(tmp_path: Path) -> None:
     """A flipped bit is refused, or changes nothing that is read; one of a sample is refused."""
     path = tmp_path / "motion.npz"

@@ -90,6 +90,7 @@ def test_a_payload_that_was_corrected_before_the_run_goes_on_is_no_longer_report
     assert (known | {"cylinders_mm": [[0.0, 200.0, 100.0]]}).items() <= saved["provenance"]["setup"].items()
 
 
+@pytest.mark.slow
 def test_a_session_saves_no_result_as_good_whose_tool_is_elsewhere_unless_it_was_not_measured(lab: Lab) -> None:
     lab.cell = replace(lab.cell, sensor=SensorConfig("fake://", height_mm=180.0, accuracy_percent=1.0))
     assert lab.calibrate() is not None

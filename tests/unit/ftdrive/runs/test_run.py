@@ -198,6 +198,7 @@ with Run(Path(sys.argv[1])):
 """
 
 
+@pytest.mark.slow
 def test_a_second_process_that_resumes_a_run_is_refused_and_a_crash_leaves_no_lock(run: Run) -> None:
     holder = subprocess.Popen([sys.executable, "-c", HOLDER, run.folder], stdout=subprocess.PIPE, text=True)
     assert holder.stdout is not None

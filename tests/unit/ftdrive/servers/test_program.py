@@ -86,6 +86,7 @@ def test_a_request_is_answered_once_and_an_old_one_never() -> None:
     assert np.diff(lives).tolist() == [1] * (len(lives) - 1)
 
 
+@pytest.mark.slow
 def test_a_cycle_weighs_the_part_and_takes_it_out_of_the_wrench() -> None:
     cell = Cell((POSE, NOTHING), (POSE, part(POSE, 0.8)), (POSE, part(POSE, 0.8)), (POSE, NOTHING))
     cell.run(0.2)
@@ -113,6 +114,7 @@ def test_a_zero_with_a_part_is_refused() -> None:
     assert cell.ask(6, ZERO, 0.8)["code"] == 8
 
 
+@pytest.mark.slow
 def test_the_tracked_bias_ages_while_a_contact_hides_it() -> None:
     drifted = np.array([0.4, -0.3, 0.2, 0, 0, 0])
     cell = Cell((POSE, drifted), (POSE, drifted + np.array([5.0, 8.0, 0, 0, 0, 0])), seconds=1.5)
@@ -171,6 +173,7 @@ def test_a_wrench_without_new_samples_is_stale_and_a_lost_controller_is_called_a
     assert cell.registers.written[-1]["state"] == 0
 
 
+@pytest.mark.slow
 def test_a_push_is_a_contact_and_its_weight_is_refused() -> None:
     cell = Cell(*[(POSE, NOTHING)] * 3, (POSE, np.array([5.0, 8.0, 0, 0, 0, 0])))
     cell.run(0.2)

@@ -276,6 +276,7 @@ def test_every_standstill_at_a_new_orientation_is_a_pose() -> None:
     assert np.abs(result.force_bias_N - BIAS[:3]).max() < 4 * np.max(result.sigma["force_bias_N"])
 
 
+@pytest.mark.slow
 def test_an_arm_that_hardly_rests_or_creeps_is_not_measured() -> None:
     outcome = Outcome([Dwell(UP, 0.9), Dwell(LEFT, 30, creep_rad_s=0.0019), Dwell(DOWN, 0.5), Dwell(FRONT)])
     assert outcome.stops == [1]
@@ -306,6 +307,7 @@ def test_without_keys_it_ends_by_itself_when_the_poses_are_enough() -> None:
     assert "press" not in outcome.person.words()
 
 
+@pytest.mark.slow
 def test_keys_pressed_while_a_pose_is_averaged_mean_what_is_shown_then() -> None:
     redone = Outcome(dwells(UP, DOWN, LEFT), keys={7.5: Key.REDO})  # pose 1 is shown, pose 2 is averaged
     assert redone.stops == [1, 1, 2]
@@ -316,6 +318,7 @@ def test_keys_pressed_while_a_pose_is_averaged_mean_what_is_shown_then() -> None
     assert paused.stops == [1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("since_s", "listen"), [(4.5, True), (8.2, False)])  # on the way; pose 2 is averaged
 def test_an_arm_that_is_silent_for_a_second_is_waited_for(since_s: float, listen: bool) -> None:
     outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), silent_s=(since_s, since_s + 1.0), listen=listen)

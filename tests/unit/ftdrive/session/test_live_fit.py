@@ -173,6 +173,7 @@ def test_a_cable_that_pulls_in_three_poses_is_named_with_them() -> None:
     assert found[-1].values["poses"] == [name(5), name(6), name(14)]
 
 
+@pytest.mark.slow
 def test_a_load_that_shifts_is_named_with_the_pose_from_which_on() -> None:
     shifted = replace(TRUTH, p_sensor_com_m=TRUTH.p_sensor_com_m + np.array([0.004, 0.002, 0]))
     change = changed(disturbed(lambda stop, R, _: predict(shifted if stop >= 6 else TRUTH, R)))
@@ -194,6 +195,7 @@ def test_a_part_that_is_lost_in_mid_tour_changes_the_load() -> None:
     assert change.values["change_N"] == pytest.approx(-0.05 * np.linalg.norm(TRUTH.gravity_force_base_N), rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_pose_that_moved_is_named_and_not_explained_otherwise() -> None:
     taken = tour()
     turned = Reading(0, np.zeros(6), taken[6].before.R_base_flange @ Rotation.from_rotvec([0, 0, 0.01]).as_matrix())
@@ -218,6 +220,7 @@ def test_tilts_with_a_hanging_load_are_enough_for_its_run() -> None:
     assert (run(records(tilts)).light, run(records(tilts), RunningFit(load=hung)).light) == ("amber", "green")
 
 
+@pytest.mark.slow
 def test_a_bumped_pose_stands_out_when_it_comes_and_can_be_taken_again() -> None:
     running, taken = RunningFit(), tour()
     run(taken[:13], running)

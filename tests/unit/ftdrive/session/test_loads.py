@@ -35,6 +35,7 @@ def test_the_payload_must_be_the_total(tool_kg: float | None, payload_kg: float,
     assert lab.arm.moves == []
 
 
+@pytest.mark.slow
 def test_a_gripped_load_is_asked_for(lab: Lab) -> None:
     weigh(lab, 1.0, 3.0)
     assert lab.calibrate(load=GRIPPED) is not None

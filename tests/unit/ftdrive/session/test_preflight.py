@@ -129,6 +129,7 @@ def test_a_tool_too_heavy_or_too_long_for_the_sensor_is_refused(
         refuse(lab, f"{words}: use a larger sensor")
 
 
+@pytest.mark.slow
 def test_a_sensor_with_an_arbitrary_zero_is_calibrated_within_its_range(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,6 +20,7 @@ def _few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ftcalib.solver.SIMULATIONS", 20)  # of the covariance of a published method
 
 
+@pytest.mark.slow
 def test_the_run_keeps_its_method_and_every_solve_uses_it(lab: Lab) -> None:
     outcome = lab.calibrate(method="lrom")
     assert outcome is not None
@@ -34,6 +35,7 @@ def test_the_run_keeps_its_method_and_every_solve_uses_it(lab: Lab) -> None:
     assert subject.reproduce == outcome.run.solve_command
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "sets", "words"),
     [

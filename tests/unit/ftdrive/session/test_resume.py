@@ -96,6 +96,7 @@ def test_an_approach_past_a_skipped_pose_is_shown_and_confirmed_by_the_operator(
     assert [question.assumed for question in ways] == ["yes", None]
 
 
+@pytest.mark.slow
 def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None:
     def drift(event: Event) -> None:
         if isinstance(event, PoseTaken):
@@ -143,6 +144,7 @@ def report(
     lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, **({"url": "ati-can://can0"} | sensor)))
 
 
+@pytest.mark.slow
 def test_a_run_that_another_process_resumes_is_refused_before_anything_moves(lab: Lab) -> None:
     folder = broken_off(lab)
     events = (folder / "events.ndjson").read_bytes()
@@ -157,6 +159,7 @@ NO_SERIAL = {"serial": NOT_REPORTED}
 BEGUN: dict[str, Any] = {"counts_per_N": 100.0, "counts_per_Nm": 1000.0, "range": (300.0,) * 6}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("then", "now", "changed"),
     [
@@ -230,6 +233,7 @@ def test_options_that_cannot_be_used_are_reported_before_anything_opens(lab: Lab
     assert lab.arm.opened == opened
 
 
+@pytest.mark.slow
 def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> None:
     at(lab, "taken 3", both(press(Key.REDO), lambda lab: at(lab, "measuring 3", press(Key.SKIP))))
     outcome = lab.calibrate()

@@ -55,6 +55,7 @@ def test_the_first_run_is_slow_and_the_second_is_not(lab: Lab) -> None:
     assert [question.text[:6] for question in lab.operator.asked].count("Is the") == 6
 
 
+@pytest.mark.slow
 def test_everything_is_kept_in_one_file_and_a_sweep_is_not_continued(lab: Lab) -> None:
     run = lab.sweep(real=False)
     assert run.in_motion
@@ -137,6 +138,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @cases({name: replace(case, mode="sweep", taken=()) for name, case in WRONG.items()})
 def test_what_ends_a_sweep(case: Case, lab: Lab) -> None:
     case.play(lab)
@@ -157,6 +159,7 @@ def seen(t_s: float, R: Array, wrench: Array, sample: int, curve: Array | None) 
     return Seen(t_s, 0.01, motion, state, STATUS, wrench, sample, 0.0)
 
 
+@pytest.mark.slow
 def test_the_plan_of_a_sweep_is_not_driven_as_a_tour(lab: Lab) -> None:
     run = lab.sweep(real=False)
     sweeps = len(lab.arm.sweeps)

@@ -35,6 +35,7 @@ def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> 
     assert len(lab.operator.of(Asked)) == 5
 
 
+@pytest.mark.slow
 def test_the_first_run_is_slow_whatever_was_asked_and_the_second_may_be_fast(lab: Lab) -> None:
     lab.take_poses(fast=True)
     assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
@@ -129,6 +130,7 @@ RUNS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", RUNS)
 def test_a_run_counts_as_complete_if_every_move_of_the_plan_was_driven(what: str, lab: Lab) -> None:
     case, complete = RUNS[what]
@@ -136,6 +138,7 @@ def test_a_run_counts_as_complete_if_every_move_of_the_plan_was_driven(what: str
     assert has_run(lab) == complete
 
 
+@pytest.mark.slow
 def test_an_arm_that_reports_no_serial_number_runs_slowly_each_time_and_the_reason_is_said(lab: Lab) -> None:
     lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
     for _ in range(2):
@@ -159,6 +162,7 @@ def test_a_dry_run_shows_all_and_moves_nothing(lab: Lab) -> None:
     assert len(lab.operator.of(Checked)) == len(preflight.CHECKS)
 
 
+@pytest.mark.slow
 def test_the_plan_is_shown_before_the_checks_and_kept_where_asked(lab: Lab) -> None:
     lab.cell = replace(lab.cell, workcell=WorkcellConfig(measured=False))
     path = lab.folder / "plan.json"
@@ -182,6 +186,7 @@ def test_the_plan_is_shown_before_the_checks_and_kept_where_asked(lab: Lab) -> N
     assert Plan.load(lab.folder / "measured.json").measured
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("away_deg", "assumed"), [((0.0, 9.0), True), ((9.0, 0.0), False)])
 def test_a_way_of_the_whole_arm_is_confirmed_by_a_person_though_the_plan_is_known(
     away_deg: tuple[float, float], assumed: bool, lab: Lab

@@ -84,6 +84,7 @@ def turn_deg(R: Any, others: Any) -> float:
     return float(np.degrees((Rotation.from_matrix(R) * Rotation.from_matrix(others).inv()).magnitude().min()))
 
 
+@pytest.mark.slow
 def test_an_unchanged_cell_passes_at_poses_that_were_not_used(
     lab: Lab, calibration: CalibrationResult, take: Callable[..., Run]
 ) -> None:
@@ -113,6 +114,7 @@ def test_an_unchanged_cell_passes_at_poses_that_were_not_used(
         save_update(found)
 
 
+@pytest.mark.slow
 def test_a_step_of_the_bias_is_named_and_the_update_names_its_parent(
     lab: Lab, calibration: CalibrationResult, take: Callable[..., Run]
 ) -> None:
@@ -133,6 +135,7 @@ def test_a_step_of_the_bias_is_named_and_the_update_names_its_parent(
     assert not last.passed
 
 
+@pytest.mark.slow
 def test_a_completed_plan_is_driven_again_and_fast(lab: Lab, take: Callable[..., Run]) -> None:
     first = Plan.load(take(fast=True).plan_path)
     slowest = max(speed for _, speed, _ in lab.arm.moves)
@@ -159,6 +162,7 @@ def test_another_sensor_is_refused_before_anything_moves(
     assert not lab.arm.moves
 
 
+@pytest.mark.slow
 def test_an_interrupted_verification_goes_on_as_one(lab: Lab, take: Callable[..., Run]) -> None:
     def unplug() -> None:
         lab.operator.answers["resume"] = ["quit"]

@@ -64,6 +64,7 @@ def test_what_the_files_say_comes_back(runs: Path, store_url: str) -> None:
     assert (store.results("other"), store.find("%")) == ([], [])
 
 
+@pytest.mark.slow
 def test_rebuilt_twice_it_is_identical_and_the_same_as_one_that_grew(runs: Path, store_url: str) -> None:
     """Runs arrive in any order, one of them as a copy of another, and are indexed again and again."""
     shutil.copytree(runs / "2026-03-03-calibrate", runs / "2026-01-01-copy")

@@ -131,6 +131,7 @@ def at_rest(t_s: float, residual: Array) -> Window:
     )
 
 
+@pytest.mark.slow
 def test_a_contact_that_grows_slowly_is_reported_once_and_covered_by_the_sigma() -> None:
     rng, tracker = np.random.default_rng(9), free_tool()
     contact, events = 3.0 * np.array([0.6, 0.0, -0.8, 0.005, 0.01, 0.0]), list[StreamEvent]()
@@ -147,6 +148,7 @@ def test_a_contact_that_grows_slowly_is_reported_once_and_covered_by_the_sigma()
     assert (off[:3] < 0.05).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_N_h", [0.0, 20.0])
 def test_the_rate_of_a_drift_has_an_honest_sigma_and_is_reported_once(rate_N_h: float) -> None:
     squares, reported = [], 0

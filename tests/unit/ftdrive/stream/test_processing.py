@@ -128,6 +128,7 @@ def test_an_impossible_filter_is_rejected() -> None:
         Processor(info(calibrated()), settings=Stages(lowpass_Hz=600.0))
 
 
+@pytest.mark.slow
 def test_inertia_leaves_only_noise_of_a_moving_tool() -> None:
     rows = moving(3.0)
     _, static = processed(rows)
@@ -178,6 +179,7 @@ def test_a_contact_is_one_event_with_its_line_of_force() -> None:
     assert not block.in_contact[2190:].any()
 
 
+@pytest.mark.slow
 def test_neither_the_filter_of_a_sensor_nor_drift_make_contacts_and_a_push_of_1_N_is_found_in_100_ms() -> None:
     n, rate_Hz = 18_000, 500.0
     rng = np.random.default_rng(4)

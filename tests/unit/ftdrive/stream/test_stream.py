@@ -212,6 +212,7 @@ def tools(cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cell:
     return cell
 
 
+@pytest.mark.slow
 def test_the_tool_is_switched_while_the_devices_stay_open(tools: Cell) -> None:
     tools.sensor.motion = tools.arm.motion = Motion()
     with open_stream(tools.config, tool="drill", stages=Stages(lowpass_Hz=200.0)) as stream:
@@ -303,6 +304,7 @@ def test_an_emulated_cell_excludes_a_real_one(cell: Cell) -> None:
         _ = stream.station
 
 
+@pytest.mark.slow
 def test_the_bias_follows_the_temperature_of_the_sensor(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     slope, sigma = np.array([0.2, 0, 0, 0, 0, 0.01]), np.full(6, 1e-3)
     errors = np.full(2, 0.1), np.full(2, 0.5)

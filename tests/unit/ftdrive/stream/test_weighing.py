@@ -133,6 +133,7 @@ def carried(
     return source
 
 
+@pytest.mark.slow
 def test_a_part_is_weighed_while_the_arm_carries_it() -> None:
     source = carried(0.8)
     read(source, 5.0)
@@ -148,6 +149,7 @@ def test_a_part_is_weighed_while_the_arm_carries_it() -> None:
     assert values.keys() == load_values(empty, source.info).keys()
 
 
+@pytest.mark.slow
 def test_a_part_that_a_sensor_known_by_loads_carries_is_weighed_without_its_error() -> None:
     usual = SensorMatrix.usual(0.03)
     error = usual.sigma * np.random.default_rng(3).normal(size=(6, 6)) + 0.03 * np.eye(6)
@@ -165,6 +167,7 @@ def test_a_part_that_a_sensor_known_by_loads_carries_is_weighed_without_its_erro
     assert abs(gain - 1) > 0.01
 
 
+@pytest.mark.slow
 def test_a_push_in_motion_is_refused_until_it_is_over() -> None:
     source = carried(0.8, push=np.array([3.0, 4.0, 0, 0, 0, 0.2]))
     read(source, 10.6)

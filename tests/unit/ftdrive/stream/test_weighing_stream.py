@@ -28,6 +28,7 @@ class Bench:
         self.weighing = Weighing(self.stream, joins=False, part_kg=None, keep=self.log.keep)
 
 
+@pytest.mark.slow
 def test_each_part_and_each_fault_is_kept_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ftdrive.stream.sources.STEP_S", 0.05)
     bench = Bench(part(POSE, 0.8), NOTHING, part(POSE, 0.3) + CABLE)

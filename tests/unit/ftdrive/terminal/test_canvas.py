@@ -76,6 +76,7 @@ def as_the_command_line(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     signal.signal(signal.SIGTERM, before)
 
 
+@pytest.mark.slow
 def test_lines_that_changed_are_sent_until_q_and_then_what_was_printed() -> None:
     def does(person: int, program: int) -> Shown:
         shown = Shown(person)
@@ -93,6 +94,7 @@ def test_lines_that_changed_are_sent_until_q_and_then_what_was_printed() -> None
     assert text.index("a warning") > text.index(LEFT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_and_only_ctrl_c_does_as_q(number: signal.Signals) -> None:
     def does(person: int, _: int) -> Shown:

@@ -80,6 +80,7 @@ def test_screen(scenario: Scenario, size: tuple[int, int], snapshot: SnapshotAss
     assert "\n".join(lines) == snapshot
 
 
+@pytest.mark.slow
 def test_every_size_is_filled_exactly() -> None:
     view = Screen("contact").summary.view()
     tall = (40, 40), (60, 70), (119, 70), (121, 40), (200, 70)

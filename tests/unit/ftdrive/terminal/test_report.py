@@ -83,6 +83,7 @@ def test_a_robot_on_a_wall_is_declared_by_an_option(tmp_path: Path, capsys: pyte
     assert [one["code"] for one in json.loads(capsys.readouterr().out)["findings"]] == ["base_leans"]
 
 
+@pytest.mark.slow
 def test_calibrate_solve_and_library_say_the_same(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
     lab.arm.set_status(payload_kg=2.5)
     lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting="3"))

@@ -303,6 +303,7 @@ def screen(person: int, program: int) -> Iterator[tuple[Screen, Shown]]:
             yield found, Shown(person)
 
 
+@pytest.mark.slow
 def test_the_screen_draws_asks_and_goes_on() -> None:
     with terminal() as (person, program):
         before = termios.tcgetattr(program)

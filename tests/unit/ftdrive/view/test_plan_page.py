@@ -63,6 +63,7 @@ def control(shown: Shown, name: str) -> dict[str, Any]:
     return dict(found)
 
 
+@pytest.mark.slow
 def test_one_button_plays_and_pauses_and_a_step_pauses(shown: Shown, page: Page) -> None:
     page.act("viewer 0", "speed", "8 ×")
     assert control(shown, "play")["label"] == "Play"

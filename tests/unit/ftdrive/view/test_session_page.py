@@ -190,6 +190,7 @@ def test_the_rest_is_that_of_the_terminal(page: Page) -> None:
     assert texts(watched.shown()["state/note"]).strip() == "a note"
 
 
+@pytest.mark.slow
 def test_the_arm_and_its_next_pose_are_drawn(lab: Lab, page: Page) -> None:
     watched = Watched(page, lab.operator)
     at: list[dict[str, Any]] = []
@@ -295,6 +296,7 @@ def is_failure(event: object) -> bool:
     return isinstance(event, Noted) and "cannot be updated" in event.words
 
 
+@pytest.mark.slow
 def test_a_page_that_hangs_is_reported_and_not_waited_for(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
     released = threading.Event()
 
@@ -375,6 +377,7 @@ def test_an_early_end_is_shown_as_the_terminal_says_it(
     assert not set(parts) & {"stop", "alert", "question", "bars"}
 
 
+@pytest.mark.slow
 def test_a_verification_ends_with_its_verdict(lab: Lab, page: Page) -> None:
     outcome = lab.calibrate()
     assert isinstance(outcome, Outcome)

@@ -77,6 +77,7 @@ def test_what_is_possible_and_what_is_not(robot: Robot) -> None:
     assert "no solution" in end_of(robot).why
 
 
+@pytest.mark.slow
 def test_blocking_moves_arrive(robot: Robot) -> None:
     q = [*HOME[:5], HOME[5] + 1.0]
     begun_s = robot.timestamp_s

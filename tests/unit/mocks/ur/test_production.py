@@ -19,6 +19,7 @@ HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 CYCLE_S = 0.002
 
 
+@pytest.mark.slow
 def test_a_cycle_picks_places_and_touches(tmp_path: Path) -> None:
     path = tmp_path / "truth.jsonl"
     world = World(Truth.drawn(2), MODELS["UR5e"], HOME, 2, CellClock(RealTime()))

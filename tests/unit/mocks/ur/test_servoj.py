@@ -52,6 +52,7 @@ def curve(t: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([HOME[4] + 0.4 * np.sin(turn) ** 2, HOME[5] - 0.8 * (1 - np.cos(turn))]).T
 
 
+@pytest.mark.slow
 def test_another_thread_stops_the_sweep() -> None:
     robot = start(SWEEP)
     run(robot, 1.5)

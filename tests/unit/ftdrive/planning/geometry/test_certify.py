@@ -167,6 +167,7 @@ def test_lids_and_edges_of_the_meshes_are_inside(model: str) -> None:
         assert outside.min() < 0.001, (name, point_mm)
 
 
+@pytest.mark.slow
 def test_certified_moves_are_clear_where_they_are_sampled_and_others_are_not_called_clear() -> None:
     rng = np.random.default_rng(3)
     some_clear, some_not = 0, 0
@@ -286,6 +287,7 @@ def along(axis: str, centre: tuple[float, float, float], half_m: float, radius_m
     return one(centre, np.eye(3)["xyz".index(axis)], half_m, radius_m, rounding_m)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1))
 def test_what_is_too_near_is_named_just_where_a_posture_is_not_free(seed: int) -> None:
     rng = np.random.default_rng(seed)

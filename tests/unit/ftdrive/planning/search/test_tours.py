@@ -28,6 +28,7 @@ def sampled_clear(certifier: Certifier, plan: Plan) -> bool:
     return bool(certifier.free(((1 - share) * q + share * np.roll(q, -1, axis=0)).reshape(-1, 6)).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "q6_deg", "poses"), [pytest.param("UR5e", -170, 24, marks=pytest.mark.slow), ("UR3e", 80, 12)]
 )
@@ -41,6 +42,7 @@ def test_wrist_3_stays_within_200_degrees_of_where_it_stands(model: str, q6_deg:
     assert sorted(step.number for step in plan.steps) == sorted(NUMBERS if poses == 24 else T12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "tool", "half_angle_deg", "most_cond9", "least_gap"),
     # Conditions of the design table: 30 degrees 6.3, 60 degrees 2.8, 120 degrees 1.23.
@@ -78,6 +80,7 @@ def test_a_tour_in_a_cone_has_an_approach(half_angle_deg: float) -> None:
     assert plan_approach(certifier, USUAL_POSTURE_RAD, plan.nodes_rad[0], Speeds()).certified
 
 
+@pytest.mark.slow
 def test_the_cone_is_about_straight_down_however_the_arm_is_mounted() -> None:
     certifier = certifier_of(scene=Scene(lean_rad=np.pi / 2))
     plan = _plan_cone(certifier, poses=6, half_angle_rad=np.radians(40), speeds=Speeds(), guess=guess_of(certifier))
