@@ -22,7 +22,7 @@ CEILINGS = {
     "dataclasses": 229,
     "public functions and classes": 1414,
     "import statements inside functions": 108,
-    "test lines": 59991,
+    "test lines": 59989,
 }
 ROOMS = {
     "a: calibrate, to the first move": 70,
@@ -45,10 +45,18 @@ def sentence(row: str, count: int, ceiling: int) -> str:
     return ""
 
 
+def statements(node: ast.AST) -> Iterator[ast.stmt]:
+    """Yield the statements inside a node, at all depths."""
+    for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for child in getattr(node, part, ()):
+            yield child
+            yield from statements(child)
+
+
 def counts_of(sources: dict[str, str]) -> dict[str, int]:
     """Count what the product has, except for lines of tests."""
     trees = [parsed(source) for source in sources.values()]
-    nodes = [[*ast.walk(tree)] for tree in trees]
+    nodes = [[*statements(tree)] for tree in trees]
     public = [node for tree in trees for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
     inside = 0
     for of_file in nodes:
@@ -78,7 +86,7 @@ def faults(sources: dict[str, str]) -> Iterator[str]:
     for path, source in sources.items():
         if (more := len(source.splitlines()) - LINES_OF_A_MODULE) > 0:
             yield f"{path} has {LINES_OF_A_MODULE + more} lines, {more} too many: divide it by what a reader looks for."
-        for node in ast.walk(parsed(source)):
+        for node in statements(parsed(source)):
             for name in node.names if isinstance(node, ast.ImportFrom) else ():
                 if name.name.startswith("_") and not name.name.startswith("__"):
                     yield f"{path}:{name.lineno} imports {name.name}: give it a public name, or move what uses it."

@@ -137,6 +137,7 @@ def test_only_the_files_of_the_page_are_served(attacked: Attacked) -> None:
             assert line in answer.partition("\r\n\r\n")[0], (address, line)
 
 
+@pytest.mark.slow
 def test_large_heads_and_bodies_are_refused(attacked: Attacked) -> None:
     before_MB = attacked.memory_MB()
     for data in (
@@ -239,6 +240,7 @@ for path in glob.glob(f"/proc/{pid}/*") + glob.glob("/proc/[0-9]*/cmdline") + gl
 """
 
 
+@pytest.mark.slow
 def test_another_user_of_the_computer_reads_nothing(ftdrive: CommandLine, monkeypatch: pytest.MonkeyPatch) -> None:
     browser, opened = ftdrive.folder / "browser", ftdrive.folder / "opened"
     browser.write_text(f'#!/bin/sh\necho "$@" > {opened}\n')

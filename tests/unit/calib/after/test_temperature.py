@@ -35,6 +35,7 @@ def test_a_slope_is_found_within_its_sigma_and_predicts() -> None:
     assert np.mean([one.error[0] for one in found]) < 0.5 * np.mean([one.error_without[0] for one in found])
 
 
+@pytest.mark.slow
 def test_a_walk_is_not_taken_for_a_temperature() -> None:
     found = [fitted(seed, np.zeros(6)) for seed in range(8)]
     assert sum(any(one.predicts) for one in found) <= 1

@@ -55,25 +55,6 @@ def nearest(found: list[rotation_minima.RotationMinimum], R: Array) -> float:
 # The cost
 
 
-@slow
-@given(seeds, st.booleans(), st.integers(3, 9))
-def test_cost_is_that_of_least_squares(seed: int, with_bias: bool, n: int) -> None:
-    R_base_flange, force, _ = problem(seed, n)
-    rng = np.random.default_rng(seed + 1)
-    weights, R = rng.uniform(0.1, 3, n), Rotation.random(rng=rng).as_matrix()
-    Q = rotation_minima.force_cost(R_base_flange, force, weights, with_bias=with_bias)
-    root = np.sqrt(weights)
-    rows = [np.hstack((R @ A.T, np.eye(3)))[:, : 6 if with_bias else 3] for A in R_base_flange]
-    J, y = np.vstack([s * row for s, row in zip(root, rows, strict=True)]), (force * root[:, None]).ravel()
-    unknowns = np.linalg.lstsq(J, y, rcond=None)[0]
-    assert cost(Q, R) == pytest.approx(np.sum((y - J @ unknowns) ** 2), rel=1e-9)
-    if with_bias:
-        found = rotation_minima.given_rotation(R, R_base_flange, force, weights)
-        assert np.concatenate(found) == pytest.approx(unknowns, abs=1e-8)
-    assert np.array_equal(Q, Q.T)
-    assert np.linalg.eigvalsh(Q)[0] > -1e-12 * np.trace(Q)
-
-
 def test_a_huge_bias_costs_no_digits() -> None:
     R_base_flange, force, R = problem(0, noise_N=0)
     best, *_ = rotation_minima.minima(rotation_minima.force_cost(R_base_flange, force + 1e5, np.ones(12)))

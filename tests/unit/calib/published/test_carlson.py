@@ -127,6 +127,7 @@ def test_exact_with_the_fewest_poses_and_one_less_is_rejected(name: str, bias: b
 # --- what a bias does ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_the_original_form_hides_a_bias_in_the_rotation_and_the_other_finds_it(name: str) -> None:
     errors: dict[tuple[float, bool], list[float]] = {(bias_N, bias): [] for bias_N in (0, 1) for bias in (False, True)}

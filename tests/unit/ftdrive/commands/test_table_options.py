@@ -63,6 +63,7 @@ def test_a_unit_may_have_a_size(solved: Solved) -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_sign_reverses_what_is_read(solved: Solved) -> None:
     reaction = PLAIN | {name: -values for name, values in wrench(POSES).items()}
     near(parameters(solved(reaction, "--sign", "-1")), parameters(solved(PLAIN)))

@@ -72,6 +72,7 @@ def test_a_load_has_no_room_under_a_low_ceiling() -> None:
         plan_for(low, certifier_for(low, "UR3e", MODELS["UR3e"], HOOK_M), USUAL_POSTURE_RAD)
 
 
+@pytest.mark.slow
 def test_a_plan_belongs_to_its_load() -> None:
     for hook_m in (None, (0.0, 0.0, 0.19)):
         with pytest.raises(PlanRefused, match="another tool"):

@@ -43,6 +43,7 @@ def test_the_limit_is_that_of_the_check_before_the_tour(payload_kg: float, lab: 
     assert (check_total_payload(before).state == "ok") == (described_cell.payload(float(payload_kg), 1.7, 0.3) == [])
 
 
+@pytest.mark.slow
 def test_a_wrong_payload_is_noted_once_when_the_fit_knows_and_is_the_first_finding(lab: Lab) -> None:
     lab.arm.set_status(payload_kg=2.5)
     outcome = lab.calibrate()

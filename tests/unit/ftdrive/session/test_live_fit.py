@@ -180,6 +180,7 @@ def test_a_load_that_shifts_is_named_with_the_pose_from_which_on() -> None:
     assert (change.code, change.values["pose"]) == ("com_shifted", 6)
 
 
+@pytest.mark.slow
 def test_a_tare_in_mid_tour_is_a_step_of_the_bias() -> None:
     step = np.array([0.3, 0, 0.2, 0, 0, 0])
     change = changed(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop >= 10) * step))

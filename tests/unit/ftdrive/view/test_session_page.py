@@ -333,6 +333,7 @@ def end(lab: Lab, page: Page) -> dict[str, Any]:
     return parts_of(page)
 
 
+@pytest.mark.slow
 def test_at_the_end_nothing_looks_live(lab: Lab, page: Page) -> None:
     parts = end(lab, page)
     assert parts["state"]["head"] == "ended"
