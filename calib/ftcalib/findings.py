@@ -422,7 +422,7 @@ CODES: Final[Mapping[str, Code]] = {
         "60 °/s or more"),
     # How well the data fit
     "gain_not_modelled": Code(_LIMIT, "the gain is off by {gain_percent:.1f}, which this method ignores (residual "
-        "{residual_N:.2g}, with the gain estimated {free_N:.2g})", "solve with method ml"),
+        "{residual_N:.2g}, or {free_N:.2g} if the gain is estimated)", "solve with method ml"),
     "force_error": Code(_REJECT_OR_LIMIT, "the force error is {share_percent:.1f} of the weight ({error_N:.2g}, "
         "{source}), limit {limit_percent:g}", "check cables, contact and orientations, and take more poses"),
     "torque_error": Code(_REJECT_OR_LIMIT, "the torque error is {share_percent:.1f} of the weight times {lever_m:.2g} "

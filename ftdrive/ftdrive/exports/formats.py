@@ -89,7 +89,7 @@ _OFFSET: Final = (
     "offset is minus the bias, because the broadcaster adds it.",
     "sensor_filter_chain needs ros2_controllers of September 2025 or newer; Humble has neither it nor offset.",
 )
-_WORLD: Final = "Gravity is in axes of {base_frame}, {base_axes}: rotate it if the axes of the world differ."
+_WORLD: Final = "Gravity is given in the axes of {base_frame}, {base_axes}: rotate it if the world axes differ."
 _OWN_READING: Final[tuple[Property, ...]] = ("tilt", "rotation", "response")
 
 # The formats by name, as in `--format`. Above each: project, file and version of the reader, and its formula.

@@ -61,7 +61,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield f"# for a {model} with this tool, mm from the flange face:"
     for part in plan.description["tool"]:
         yield f"#   {_cylinder(part)}"
-    yield "# proven clear, all along its moves, of itself and of these surroundings, mm, base axes:"
+    yield "# proven clear, along all moves, of the arm itself and of these surroundings (mm, base axes):"
     yield from (f"#   {plain_ascii(line)}" for line in _scene(plan.description["scene"]))
     yield f"# {plain_ascii(plan.room_in_words())}"
     yield f"# Speed: {_speeds(plan)}."

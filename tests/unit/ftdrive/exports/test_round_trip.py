@@ -85,8 +85,8 @@ def gravity_m_s2(name: str, made: Exported, calibration: CalibrationResult) -> A
         case "ur-payload":
             gravity = np.negative(e.pop("set_gravity"))
         case "urdf" | "mujoco":
-            (note,) = (note for note in made.notes if note.startswith("Gravity is in axes of "))
-            frame = note.removeprefix("Gravity is in axes of ").partition(",")[0]
+            (note,) = (note for note in made.notes if note.startswith("Gravity is given in the axes of "))
+            frame = note.removeprefix("Gravity is given in the axes of ").partition(",")[0]
             gravity = e.pop("gravity of the simulation" if name == "urdf" else "option gravity")
     assert not e
     return None if gravity is None else np.asarray(world_from_base(frame).T @ gravity)
