@@ -342,8 +342,8 @@ def restore(cell: CellConfig, arm: RobotArm, receipt: Receipt) -> Push:
     made = receipt.devices["arm"]["model"], receipt.devices["arm"]["serial"]
     if made != (info.model, info.serial):
         raise NotAccepted(
-            f"{receipt.path} belongs to the arm {made[0]}, serial {made[1]}, but {info.model}, serial {info.serial}, is "
-            "connected: connect the arm that the receipt names"
+            f"{receipt.path} belongs to the arm {made[0]}, serial {made[1]}, but {info.model}, serial {info.serial}, "
+            "is connected: connect the arm that the receipt names"
         )
     _require_ready(cell, arm)
     old, changed = receipt.old, receipt.new
