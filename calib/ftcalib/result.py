@@ -448,8 +448,8 @@ class CalibrationResult(Displayed, Calibrated):
     def noise_explains(self) -> bool:
         """Whether the residuals agree with the noise model.
 
-        True for an update, which has too few poses for a test. In motion, it is true if smooth errors do not make the
-        error at the next use larger than the error predicted from the covariance.
+        True for an update, which has too few poses for a test. For a calibration in motion, true unless slowly varying
+        errors raise the expected error at the next use above the value predicted from the covariance.
         """
         if self.motion is not None:
             return bool((self.likely_error() <= np.array(self.predicted_error())).all())
@@ -578,7 +578,7 @@ class CalibrationResult(Displayed, Calibrated):
 
     @classmethod
     def load(cls, path: str | Path, *, accept_edited: bool = False) -> Self:
-        """Return the result in a calibration file, see `from_dict`. Raises `BadCalibration` or `OSError`."""
+        """Return the result in a calibration file, see `from_dict`. An unreadable file raises `OSError`."""
         try:
             return cls.from_dict(read_object(path, BadCalibration, accept_changed=True), accept_edited=accept_edited)
         except BadCalibration as exc:

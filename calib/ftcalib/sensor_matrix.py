@@ -16,7 +16,7 @@ calibration, the reading of a contact is M times the contact, with
     M = I + E - blk([d]x, [d]x)        d: half the antisymmetric part of E_FF + E_FT [p]x, p the centre of mass
 
 so the error of the decoded contact is linear in the error of E. Entries of E that no load has shown keep their prior. A
-weighed tool shows one more number: the gain common to all axes at its centre of mass.
+weighed tool determines one more number: the gain common to all axes at its centre of mass.
 
 The errors of E and of the mounting are correlated. The mounting of a separate calibration has its own noise and the d
 of the current E. If its poses are among those of the runs with loads, the joint fit contains the correlation.
@@ -444,7 +444,7 @@ class SensorMatrix(Displayed):
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Return the matrix in the document of a sensor file. Raises `BadCalibration`, also for implausible values."""
+        """Return the matrix in a sensor file's document. Raises `BadCalibration` for missing or implausible values."""
         check_format(document, FORMAT, BadCalibration)
         names = ("error", "covariance", "source", "lever_m", "floor", "provenance")
         try:
@@ -480,7 +480,7 @@ class SensorMatrix(Displayed):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Return the matrix in a sensor file. Raises `BadCalibration` or `OSError`."""
+        """Return the matrix in a sensor file. Raises `BadCalibration` for invalid content, `OSError` if unreadable."""
         try:
             return cls.from_dict(read_object(path, BadCalibration))
         except BadCalibration as exc:

@@ -378,7 +378,7 @@ def estimator_of(
     *,
     as_published: bool = False,
 ) -> Estimator:
-    """Return the estimator of a published method, with mounting and gravity from `known`. Raises `NotObservable`."""
+    """Return the estimator of a published method, given `known`. Raises `NotObservable` for unsuitable poses."""
     known = known or Known()
     direction = -setup.up if known.gravity_direction_base is None else known.gravity_direction_base
     return published(

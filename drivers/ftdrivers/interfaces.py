@@ -22,7 +22,7 @@ from ftdrivers.sweep import Sweep
 Array = NDArray[np.float64]
 
 Guard = Callable[[], None]
-"""Called between two samples of the arm. It raises if the motion must not go on."""
+"""Function that is called between two samples of a moving arm. It raises an error if the motion must not go on."""
 
 
 NOT_REPORTED: Final = "not reported"
@@ -166,7 +166,7 @@ class Health:
 
     received: int
     lost: int
-    """Number of samples that the device sent or was polled for, and that never arrived or arrived too late."""
+    """Number of samples that the device sent, or was polled for, but that never arrived or arrived too late."""
     malformed: int
     """Number of damaged frames, which were dropped."""
     rate_Hz: float
@@ -178,7 +178,7 @@ class Health:
     out_of_order: int = 0
     """Number of samples that arrived after a newer one and were dropped. They are part of `lost`."""
     stale: int = 0
-    """Number of silences longer than `StreamLimits.stale_s` after which samples arrived again."""
+    """Number of gaps without a sample, longer than `StreamLimits.stale_s`, after which samples arrived again."""
     reconnects: int = 0
     """Number of interruptions after which the driver has reconnected, see `StreamingSensor.recover`."""
     nominal_rate_Hz: float = math.nan
@@ -293,7 +293,7 @@ class Diagnosis:
 class _Device(ABC):
     @abstractmethod
     def open(self) -> None:
-        """Connect. Idempotent. Raises `ConnectError`."""
+        """Connect to the device. Idempotent. Raises `ConnectError` if the device cannot be opened."""
 
     @abstractmethod
     def close(self) -> None:
@@ -334,7 +334,7 @@ class ForceTorqueSensor(_Device):
 
     @abstractmethod
     def open(self) -> None:
-        """Connect and start the stream. Raises `ConnectError`.
+        """Connect and start the stream. Raises `ConnectError` if that fails.
 
         Does nothing while the stream runs. Reopens a stream that has ended.
         """
@@ -384,7 +384,7 @@ class RobotArm(_Device):
 
     @abstractmethod
     def open(self, *, control: bool = False) -> None:
-        """Connect, read-only unless `control` is requested. Idempotent. Raises `ConnectError`.
+        """Connect, read-only unless `control` is requested. Idempotent. Raises `ConnectError` if that fails.
 
         It never stops the program of another client. While one runs on the controller, requesting control raises
         `ConnectError`.
@@ -511,7 +511,7 @@ class ReadOnlyArm(RobotArm):
     """
 
     def open(self, *, control: bool = False) -> None:
-        """Do nothing, or raise `ConnectError` if control is requested."""
+        """Do nothing; raise `ConnectError` if control is requested, because this arm is only read."""
         if control:
             raise ConnectError(*_REFUSAL)
 

@@ -26,7 +26,7 @@ from ftdrivers.streaming.sensor import StreamingSensor
 
 ARMS: Mapping[str, str] = {"ros2": "ftdrivers.ros2.arm:Ros2Arm", "ur": "ftdrivers.ur.arm:UrArm"}
 
-# The extra of ftdrive that installs a library.
+# Extra of ftdrive that installs a library which a driver needs, by the name of the library.
 _EXTRAS: Mapping[str, str] = {"pynetft": "netft"}
 
 _EXAMPLES = (
@@ -142,7 +142,7 @@ class _UrlParts:
 
 
 def split_url(url: str) -> _UrlParts:
-    """Split an address into its parts. Raises `BadUrl`."""
+    """Split an address into its parts. Raises `BadUrl` if the address is not a valid URL."""
     try:
         parts = urlsplit(url)
     except ValueError as exc:

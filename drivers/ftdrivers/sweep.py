@@ -118,7 +118,7 @@ class Sweep:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build a sweep from the dictionary of `to_dict`. Raises `KeyError`, `TypeError` or `ValueError`."""
+        """Build a sweep from the dictionary of `to_dict`; a wrong one raises KeyError, TypeError or ValueError."""
         return cls(**document)
 
 

@@ -101,17 +101,17 @@ class Recording:
         self._played = (now_s, at_s, pace)
 
     def at_s(self, t_s: float) -> float:
-        """Return the time in the recording at a time of the cell, s, at most that of the last row."""
+        """Convert a time of the cell's clock to the time in the recording, s; after its end, that of the last row."""
         return float(self._at_s(np.array([t_s]))[0])
 
     def wrench(self, t_s: Array) -> Array:
-        """Return the raw wrench (n, 6) at times of the cell: that of the latest row."""
+        """Return the raw wrench (n, 6) at the given cell times: for each time, that of the latest row not after it."""
         rows = np.searchsorted(self._t_s, self._at_s(t_s) + _ROUNDING_S, side="right") - 1
         wrench: Array = self._wrench[rows]
         return wrench
 
     def joints(self, t_s: float) -> JointState:
-        """Return joint angles and speeds at a time of the cell, by linear interpolation."""
+        """Return the recorded joint angles and speeds at a time of the cell's clock, by linear interpolation."""
         at_s = self.at_s(t_s)
         row = min(int(np.searchsorted(self._t_s, at_s, side="right")), len(self) - 1)
         (before, after), (a, b) = self._t_s[row - 1 : row + 1].tolist(), self._q_rad[row - 1 : row + 1]
@@ -157,7 +157,7 @@ class RecordedArm(Arm):
     def step(self, dt: float, t_s: float = 0.0) -> None:
         """Set the joints to those of the recording at `t_s` of the cell's clock."""
         q, qd, _qdd = self._recording.joints(t_s)
-        if q != self.q:  # while the arm rests, return the same object, by which readers recognise the rest
+        if q != self.q:  # at rest, keep the same tuple: other code detects rest by comparing identities
             self.q = self.actual_q = q
         self.qd = self.actual_qd = qd if any(qd) else ZERO6
         self.still_s = 0.0 if any(qd) else self.still_s + dt

@@ -25,11 +25,11 @@ from ftcalib.sensor_matrix import LOAD, SIZE, Response, response_columns, sensor
 
 # False-alarm probability of the test of the prior.
 FALSE_ALARMS = 1e-4
-# Indices of the rows of a prior: three for the mounting, two for the base.
+# Indices of the rows of a `CellPrior`: three for the mounting, two for the tilt of the base.
 WHOLE = (0, 1, 2, 3, 4)
 _MOUNTING, _BASE = WHOLE[:3], WHOLE[3:]
 
-# Function from the used rows of the prior to the misfit, its degrees of freedom, and the parameters.
+# Function that fits with the given rows of the prior; returns misfit, its degrees of freedom, and parameters.
 _Refit = Callable[[Sequence[int]], tuple[float, int, Parameters]]
 
 
@@ -56,7 +56,7 @@ class CellPrior:
         return len(self.coefficients) > 0
 
     def count(self, kept: Sequence[int]) -> int:
-        """Return the number of rows; `kept` as in `rows`."""
+        """Return the number of rows of the prior that are used; `kept` has the meaning that it has in `rows`."""
         return len(kept) + len(self.coefficients) * bool(kept)
 
     def rows(self, p: Parameters, coefficients: Array, kept: Sequence[int] = WHOLE) -> tuple[Array, Array]:
@@ -130,7 +130,7 @@ class CellPrior:
         return f"{causes} since {self.earlier.id} ({misfit}): {alone}."
 
 
-# Largest part of the response that depends on the load, as a share of the load: usually, and in rare cases.
+# Errors of a sensor whose gain depends on the load, relative to the load: the usual and the largest assumed size.
 _LOADS = (LOAD, 0.02)
 _MOST_STEPS = 30
 # Convergence: squared step in standard deviations.
@@ -173,7 +173,7 @@ def new_tool(
     noise = pooled_covariance(dataset.wrench_cov, dataset.n_samples)
     prior, data = CellPrior(earlier), "the poses"
     alone = "calibrate this tool alone, with 12 poses or more"
-    # A larger dependence on the load is assumed only if no change of the cell explains the poses.
+    # The larger load-dependent error of the sensor is assumed only if no change of the cell explains the poses.
     for load in _LOADS:
         weights: Array = np.linalg.inv(noise + np.diag(_beyond(earlier, start, load))).astype(np.float64)
         poses = dataset.R_base_flange, dataset.wrench, weights
@@ -188,7 +188,7 @@ def new_tool(
             break
     if changed:
         raise NotObservable(changed)
-    # Components that belong to the arm and the sensor are kept, but not those of one session.
+    # Variance components of arm and sensor are kept; those of one session, such as drift, are not.
     kept = {name: value for name, value in earlier.components.items() if name in ("rotation_rad", "hysteresis")}
     result = apply_update(earlier, fitted, {**(provenance or {}), "dataset_sha256": dataset.sha256()})
     return replace(result, quality={}, weights=None, components=kept)
@@ -247,7 +247,7 @@ def _beyond(earlier: CalibrationResult, new: Parameters, most: float = LOAD) -> 
     It is scaled with the third power of the load, up to the share `most` of the load.
     """
     measured = np.square(np.zeros(6) if earlier.measured_sigma is None else earlier.measured_sigma)
-    # One sigma of chi2 / dof.
+    # Standard deviation of the ratio chi2 / dof.
     hidden = np.sqrt(2 / max(earlier.dof, 1))
     if earlier.noise_explains:
         variance = (max(earlier.chi2 / max(earlier.dof, 1) - 1, 0.0) + hidden) * measured

@@ -91,7 +91,7 @@ def calibration_difference(first: EstimatedParameters, second: EstimatedParamete
 
 
 def _test(change: Array, covariance: Array, rows: NDArray[np.intp]) -> ChiSquare:
-    """Return the test of some rows; directions without variance are ignored unless they differ."""
+    """Return the chi-square test of some rows of a difference. Values without variance must be equal."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     known = sigma[rows] <= _KNOWN * sigma.max()
     if np.any(change[rows[known]] != 0):
@@ -126,7 +126,7 @@ def _test(change: Array, covariance: Array, rows: NDArray[np.intp]) -> ChiSquare
 #
 # If a step is significant and fits better than any onset, the series is restarted at t1 with a free c.
 
-# Smallest number of verifications; fewer do not show their scatter.
+# Smallest number of verifications for a drift onset, because fewer do not show their scatter.
 FEWEST = 6
 # Largest p-value of a significant onset, for one component in one analysis. It allows for the search over onsets, six
 # components and 365 analyses a year. Simulated false alarms and delays: docs/contributing/figures/fleet.md.
@@ -202,7 +202,7 @@ def _onsets(t: Array, d: Array, w: Array, known: Array, *, from_calibration: boo
         t0 = np.append(0.0, t0)
     if not len(t0):
         t0 = t[:1]
-    later = np.searchsorted(t, t0, side="right")  # the first verification after each onset
+    later = np.searchsorted(t, t0, side="right")  # index of the first verification after each trial onset
     x = t[:, None]
     W, Wt, Wtt, Wd, Wtd = (_reversed_sums(part)[later] for part in (w, w * x, w * x * x, w * d, w * x * d))
     z = t0[:, None]
@@ -241,7 +241,7 @@ def _p_value(chi2: Array, total: Array, dof: int) -> Array:
 
 # Linear trend of an estimate over successive calibrations, and its significance.
 
-# Smallest number of estimates; two points show no scatter about a line.
+# Smallest number of estimates for a trend, because two points show no scatter about a line.
 FEWEST_ESTIMATES = 3
 
 
@@ -308,7 +308,7 @@ def trend(t: Array, values: Array, covariance: Array) -> Trend:
 
 # Smallest difference between the coldest and the warmest run, K.
 _LEAST_K = 3.0
-# Largest p-value of a slope that is used.
+# Largest p-value of a temperature slope of the bias that is used for predictions.
 SURE = 1e-3
 # Largest number of runs; older runs are ignored, because the random walk makes them irrelevant.
 _MOST = 100
@@ -325,7 +325,7 @@ class BiasTemperature:
     sigma: Array
     """(6,) standard deviation of the slope."""
     n: int
-    """Number of runs."""
+    """Number of runs (calibrations and verifications) from which the slope is estimated."""
     coldest_C: float
     warmest_C: float
     error: Array
@@ -337,12 +337,12 @@ class BiasTemperature:
 
     @property
     def predicts(self) -> tuple[bool, bool]:
-        """Whether the temperature improves the prediction of the bias of force, and of torque."""
+        """(2,) whether the temperature improves the prediction of the force bias, and of the torque bias."""
         force, torque = (self.error < self.error_without) & (self.p_value < SURE)
         return bool(force), bool(torque)
 
     def change(self, from_C: float, to_C: float) -> tuple[Array, Array]:
-        """Return the change (6,) of the bias between two temperatures and its sigma; 0 where it is not predicted.
+        """Return the bias change (6,) between two temperatures, and its sigma; both 0 where `predicts` is false.
 
         Temperatures beyond those of the runs are clipped to the nearest of them.
         """
@@ -393,11 +393,11 @@ def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Ar
 
 
 class _TemperatureFit(NamedTuple):
-    # (k, 3) coefficients of the columns.
+    # (k, 3) coefficients of the k columns, for the three axes of force or torque.
     x: Array
-    # (3,) standard deviation of the last coefficient.
+    # (3,) standard deviation of the last coefficient, which is the temperature slope.
     sigma: Array
-    # Leave-one-out rms error.
+    # Leave-one-out rms error of the fit, over runs and axes.
     left_out: float
 
 
@@ -410,7 +410,7 @@ def _fit_columns(X: Array, walk: Array, y: Array, noise: Array) -> _TemperatureF
             W = np.linalg.inv(np.diag(noise + scatter + 1e-9 * spread + 1e-24) + walked * walk)
             information = X.T @ W @ X
             C = np.linalg.inv(information)
-            P = W - W @ X @ C @ X.T @ W  # maps y to weighted residuals
+            P = W - W @ X @ C @ X.T @ W  # matrix that maps the data y to weighted residuals
             left = P @ y
             tried.append((C @ X.T @ W @ y, float(C[-1, -1]), left / np.diag(P)[:, None]))
             determinants = 3 * (np.linalg.slogdet(W)[1] - np.linalg.slogdet(information)[1])

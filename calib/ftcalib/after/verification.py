@@ -64,16 +64,16 @@ _SEVERAL = ("bias and payload", "all")
 _COST = 8.0
 # Smallest p-value of the remaining misfit of a change that explains the readings.
 _UNEXPLAINED = 1e-3
-# Two changes with a smaller difference in chi2 are not distinguished: odds of 100 to 1.
+# Smallest difference in chi2 by which one change is preferred to another: odds of 100 to 1.
 _INDISTINCT = 9.2
 FEWEST = 2
 
 # Trial sizes of gain and cross-talk that the fit did not find, and of smooth errors, relative to usual ones.
 _USUAL_GAINS = np.array([0.1, 1.0])
 _USUAL_SMOOTH = np.geomspace(0.15, 2, 3)
-# Share of smooth errors that depends on joint angles rather than on the orientation, if the fit shows this share.
+# Share of smooth errors that depends on joint angles rather than on the orientation, if the fit can detect it.
 _OTHER_JOINTS = 0.8
-# Otherwise, variances for other joint angles, as multiples of those in the fit, and at least those of a usual arm.
+# If the fit cannot, errors at other joint angles: variance relative to that in the fit, and to that of a usual arm.
 _BEYOND, _LEAST_BEYOND = 2.0, np.array([1.0, 0.0])
 # Largest number of poses of the fit from which smooth errors are estimated.
 _FEW_TO_SMOOTH = 100
@@ -99,7 +99,7 @@ class Expected:
     factor: float = 1.0
     """Factor of all variances, of noise and calibration; chi2 does not include it."""
     weight: float = 1.0
-    """Probability of the explanation among others of its kind."""
+    """Probability of this distribution among the alternatives for other sizes of the errors; they sum to 1."""
 
     def distance(self, R_base_flange: Array, wrench: Array) -> tuple[Array, Array, float]:
         """Return the residuals (n, 6), their sigma (n, 6), and their joint chi2."""
@@ -161,7 +161,7 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
         freedom = len(c) * calibration.dof / 6
         if kind == "walk":
             part[:, c, :, c], since[c] = sigma**2 * np.minimum.outer(later, later), sigma**2 * (to_end + 1)
-            freedom = len(c) * (n_used - 1) / 2  # the other half belongs to the white noise
+            freedom = len(c) * (n_used - 1) / 2  # the other half of them belongs to white noise
         elif kind == "slope":
             part[:, c, :, c], since[c] = sigma**2 * np.outer(later, later) / n_used**2, sigma**2
             freedom = len(c)
@@ -169,14 +169,14 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
             turn = jacobian(calibration.parameters, R_base_flange)[..., :3]
             part[range(n), :, range(n)] = sigma**2 * (turn @ np.swapaxes(turn, 1, 2))
             freedom = max(2 * n_used - 6, 2)
-        elif kind == "white":  # includes all noise if it was not measured
+        elif kind == "white":  # if the noise was not measured, this component contains all of it
             known = np.zeros_like(wrench_cov) if calibration.noise_source == "measured" else wrench_cov
             for k in c:
                 part[range(n), k, range(n), k] = np.maximum(sigma**2 - known[:, k, k], 0.0)
-        elif kind == "hysteresis":  # six shares, one for each axis
+        elif kind == "hysteresis":  # hysteresis: one coefficient for each of the six axes
             T = hysteresis_columns(calibration.parameters, R_base_flange).reshape(6 * n, -1)
             part, freedom = (sigma**2 * T @ T.T).reshape(n, 6, n, 6), 6
-        else:  # gain and cross-talk are part of the response
+        else:  # gain and cross-talk are in `response`, not in the noise
             continue
         gap += since
         part[:, range(6), :, range(6)] += since[:, None, None]
@@ -259,7 +259,7 @@ def expected_with_smooth_errors(
 
 
 def _components(calibration: CalibrationResult) -> Mapping[str, float]:
-    """Return the components of the noise, including a linear drift that was part of the model."""
+    """Return the variance components of the fit by name; a linear drift, if modelled, is one of them."""
     found = dict(calibration.components)
     if calibration.drift is not None and not any(name.startswith(("walk", "slope")) for name in found):
         found |= {f"slope_{name}": float(abs(calibration.drift.change[c[0]])) for name, c in _AXES.items()}

@@ -73,7 +73,7 @@ class Weight(Displayed):
     mass_sigma_kg: float
     """Standard deviation from noise, calibration and drift, without the scale of the sensor (`scale_sigma`), kg."""
     least_kg: float
-    """Smallest mass that this weighing can distinguish from zero, kg."""
+    """Smallest mass that this weighing could have distinguished from zero, kg."""
     p_sensor_com_m: Array
     """(3,) centre of mass; meaningless unless `is_something`."""
     com_covariance: Array
@@ -122,7 +122,7 @@ class Weight(Displayed):
 
 
 def drift_since(seconds: float, per_h: Array = _DRIFT_PER_H) -> Array:
-    """Return the standard deviation (6,) of the change of a bias over a time, N and N·m; infinity: never zeroed."""
+    """Return the sigma (6,) of a bias change over this time since zeroing, N and N·m; infinite time: never zeroed."""
     return np.asarray(np.minimum(per_h * max(seconds, 0.0) / 3600, _USUAL_DRIFT))
 
 

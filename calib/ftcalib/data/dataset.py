@@ -188,7 +188,7 @@ class CalibrationDataset(Displayed):
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Return the dataset from the document of a file; unknown fields are ignored. Raises `BadDataset`."""
+        """Return the dataset from the document of a file, ignoring unknown fields. Invalid data raise `BadDataset`."""
         check_format(document, FORMAT, BadDataset)
         names = ("R_base_flange", "wrench", "wrench_cov", "n_samples", "t_s", "meta")
         missing = [name for name in names if name not in document]
@@ -209,7 +209,7 @@ class CalibrationDataset(Displayed):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Return the dataset in a file. Raises `BadDataset` or `OSError`."""
+        """Return the dataset in a file. Raises `BadDataset` for invalid content, `OSError` for an unreadable file."""
         try:
             return cls.from_dict(read_object(path, BadDataset))
         except BadDataset as exc:

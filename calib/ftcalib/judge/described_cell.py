@@ -21,15 +21,15 @@ from ftcalib.rounding import to_place_of
 # Tolerated distance of a centre of mass on the robot's side of the sensor origin, where adapter plates may be.
 INSIDE_M = 0.01
 REVERSED_TILT_DEG = 135.0
-# Tilt above which the robot must be mounted on a wall.
+# Tilt of the base above which the robot must be mounted on a wall.
 HANGING_DEG = 60.0
-# Largest angle of a lean; a larger angle means another mounting.
+# Largest angle between measured and expected gravity that counts as a leaning base; more means another mounting.
 OTHER_MOUNTING_DEG: Final = 10.0
-# Smallest lean that is reported: about the accuracy of an arm's orientation.
+# Smallest angle of a leaning base that is reported: about the accuracy of an arm's orientation.
 LEAN_DEG: Final = 0.2
-# Tolerance of the described cylinders, for cables and screws.
+# Distance by which a centre of mass may be outside the described cylinders, because of cables and screws.
 COM_MARGIN_M = 0.01
-# A centre of mass farther outside the tool than this is wrong. If it is closer, the description may be wrong.
+# A centre of mass farther outside the described tool is wrong. If closer, the description may be wrong instead.
 SURELY_OUTSIDE_M = 0.1
 # Wrong units are suspected if the centre of mass is outside the tool and farther from the sensor than this.
 FAR_COM_M = 0.1
@@ -42,7 +42,7 @@ _SIGMAS_OF_MARGIN: Final = 3.0
 PAYLOAD_KG, PAYLOAD_SHARE = 0.5, 0.3
 # Additional tolerance of a larger payload if the mass of sensor and adapter is unknown.
 SENSOR_KG: Final = 0.3
-# Wrong units are suspected if the payload differs by more than this, and agrees within this share in another unit.
+# A payload that differs by more than this mass (kg), but agrees in another unit within this share: wrong units.
 UNIT_KG, UNIT_SHARE = 0.8, 0.3
 _SIGNIFICANT: Final = 4.0
 

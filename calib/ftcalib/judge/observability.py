@@ -18,10 +18,10 @@ LEAST_POSES = 4
 RECOMMENDED_POSES = 6
 RANK_TOLERANCE = 1e-9
 POOR_CONDITION = 1e4
-# With this gap, eight poses distinguish the two solutions even if the tool weighs only ten times the noise.
+# With this gap to the second solution, eight poses distinguish both, even if the weight is only ten times the noise.
 WEAK_GAP = 0.02
 AMBIGUOUS_GAP = 1e-6
-# In 7361 simulated calibrations, a second solution with chi2 larger by this was never the right one.
+# In 7361 simulated calibrations, a second solution with a chi2 larger by this difference was never the right one.
 ACCEPTED_DELTA_CHI2 = 12.0
 SAME_ORIENTATION_RAD = np.deg2rad(0.5)
 # Usual ratio of torque noise to force noise.
@@ -247,7 +247,7 @@ def _ambiguities(
             "reversed gravity with the sensor turned by 180° about that axis explains them as well",
         )
     mean = gravity_flange.mean(axis=0)
-    length = float(np.linalg.norm(mean))  # zero for balanced sets
+    length = float(np.linalg.norm(mean))  # zero if the gravity directions point equally to all sides
     widest = np.rad2deg(np.arccos(np.clip((gravity_flange @ mean).min() / max(length, _THIN), -1, 1)))
     if widest < _NARROW_DEG:
         return (
@@ -389,7 +389,7 @@ def largest_gap(directions: Array) -> tuple[float, Array]:
 
 
 def axes_along(direction: Array) -> list[str]:
-    """Return the names of the axes along or between which a unit vector (3,) points, such as "-x"."""
+    """Return the names of the axes along or between which a unit vector (3,) points, such as ["-x"]."""
     return [
         f"{'-' if part < 0 else '+'}{axis}"
         for axis, part in zip("xyz", direction.tolist(), strict=True)

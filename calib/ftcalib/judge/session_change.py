@@ -41,15 +41,15 @@ from ftcalib.sensor_matrix import response_columns
 FEWEST_POSES = 10
 # Smallest number of poses before and after a change.
 FEWEST_ON_A_SIDE = 3
-# Largest number of poses that are examined, and that number for sessions of more than 1000 poses.
+# Largest number of poses that are searched for a change: normally, and in sessions of more than 1000 poses.
 MOST_POSES, OF_MANY = 300, 150
 # A change is fitted only if it reduces the mean square misfit below this share.
 CLEARLY = 0.9
-# With residuals smaller than this share of the weight, a change is treated as linear.
+# If the residuals are below this share of the weight, the effect of a change is computed by linearisation.
 SMALL = 0.01
 # Required gain in twice the log-likelihood, in addition to log(6 n) for each parameter of the change.
 MARGIN = 10.0
-# The required gain for steps of the bias and for alternating sensors, which resemble drift and hysteresis.
+# Larger value of `MARGIN` for bias steps and alternating sensors, which resemble drift and hysteresis.
 LARGER_MARGIN = 20.0
 # Number of parameters of mounting and gravity, as matrix and vector without their common scale.
 _SHAPE = 11
@@ -83,7 +83,7 @@ class SessionChange:
     rows: Rows
     """(n,) in the order of time: whether a row has changed, or the number of bias steps before it."""
     values: Mapping[str, float]
-    """Values of the finding."""
+    """Values of the finding about this change, by name."""
     corrected: Array
     """(n, 6) wrench with the change removed."""
     misfit: float
@@ -400,9 +400,9 @@ def _norm(vector: Array) -> float:
 FALSE = 1e-3, 1e-4
 # False-alarm probability if the torques have more noise than measured, for which a cable is a common cause.
 FALSE_IN_NOISE = 0.05
-# Number of poses: with fewer no test is possible, and a tour rarely has more.
+# Smallest and largest number of poses for the test of a cable; a tour rarely has more.
 FEWEST, MOST = 8, 1000
-# Number of parameters of the stiffness and of the slack orientation.
+# Number of parameters of a cable: stiffness, and orientation in which it is slack.
 STIFFNESS, SLACK = 9, 3
 STARTS = 24
 STEPS_RAD = np.deg2rad([40.0, 20.0, 10.0])

@@ -8,10 +8,10 @@ from ftcalib.findings import Finding, Severity
 from ftcalib.model import Parameters
 
 USUAL_COM_M = (0.02, 0.2)
-# Distances of the centre of mass above which a result is limited: if the tool is not described, and with any tool.
+# A centre of mass farther than this from the sensor limits the verdict: without a described tool, and always.
 FAR_COM_M, FARTHEST_COM_M = 0.25, 0.5
 NEAREST_COM_M = 5e-4
-# Weights outside the first two limits look like forces in another unit: below 30 g, or above the payload of UR arms.
+# Weights below 0.3 N (30 g) or above 500 N (the payload of UR arms) look like forces in another unit.
 LIGHTEST_N, HEAVIEST_N, IMPOSSIBLE_N = 0.3, 500.0, 2000.0
 # Bias of force and torque, N and N·m, beyond the range of most sensors, and beyond that of any sensor on an arm.
 LARGE_BIAS, IMPOSSIBLE_BIAS = (500.0, 100.0), (2000.0, 400.0)

@@ -32,7 +32,7 @@ from ftcalib.sensor_matrix import Response
 SIGNIFICANT_SIGMAS = 5.0
 NOISE_FACTOR = 3.0
 USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
-# Largest mean square of leave-one-out residuals, in sigma, at which few poses agree with their covariance.
+# Few poses count as agreeing with their covariance up to this mean square of the normalised leave-one-out residuals.
 _AS_PREDICTED = 4.0
 # If residuals reach half the weight, estimates of gravity and centre of mass are meaningless.
 SENSELESS_SHARE = 0.5
@@ -40,8 +40,8 @@ SENSELESS_SHARE = 0.5
 NOISY_SHARE = 0.01
 # Largest structured error of a good result, as a share of the weight.
 STRUCTURED_SHARE = 0.002
-# Largest structured error of a good result in motion, which is noted in a static result; and the orientation error of
-# a calibrated arm, which is accepted in motion.
+# Structured error above which a result in motion is not good, and a static result gets a note; and the orientation
+# error of a calibrated arm, which is accepted in motion.
 SMOOTH_SHARE, CALIBRATED_ARM_RAD = 0.0005, 0.001
 # Torque errors are compared with the weight at this lever, or at the centre of mass if that is farther.
 USUAL_LEVER_M = 0.1
@@ -49,7 +49,7 @@ CORRELATED = 0.9
 FEW_LEFT_OUT = 0.1
 # Torque residual, as a share of the change of the torques, above which the torques do not follow the weight.
 UNRELATED = 0.8
-# Number of poses that are searched for mistakes, and length of the runs of successive poses among them.
+# Largest number of poses searched for mistakes, and the number of successive poses in each group of them.
 ENOUGH_FOR_FAULTS, SUCCESSIVE = 2000, 100
 # False-alarm probability of a finding.
 SURE = 1e-3

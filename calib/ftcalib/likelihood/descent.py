@@ -146,7 +146,7 @@ def wrench_gram(R_base_flange: Array, wrench: Array, reference: Array) -> Array:
 
 
 MAX_STEPS = 100
-# A descent whose last step is smaller than this, in standard deviations of the noise, counts as converged.
+# Convergence: length of the last step of a descent, in standard deviations of the noise.
 SMALL_STEP = 1e-4
 MOST_MINIMA = 6
 SAME_ROTATION_RAD = np.deg2rad(1.0)
@@ -207,7 +207,7 @@ class Descent:
             start = self.constraints.satisfy(_linear_start(start_from, R_flange_sensor))
             ends.append(self.down(statistics, start))
         minima = self.distinct(ends)
-        if n <= CHUNK:  # repeat with a close reference, so that data without noise are fitted to the last digit
+        if n <= CHUNK:  # repeat with the solution as reference, so that data without noise are fitted to the last digit
             statistics = Statistics.of(phi, self.wrench, weights, coefficients(minima[0].parameters))
             minima[0] = self.down(statistics, minima[0].parameters)
         return minima
@@ -322,14 +322,14 @@ ANNEALING = 1.6
 
 
 def fewest_kept(n: int) -> int:
-    """Return the number of poses that must agree with each other before the others may be rejected."""
+    """Return the number of poses, of n, that must agree with each other before the others may be rejected."""
     return n if n < FEWEST_TO_REJECT_FROM else max(FEWEST_TO_REJECT_FROM - 1, int(np.ceil(0.6 * n)))
 
 
 def agreeing_poses(descent: Descent, weights: Array, starts: Sequence[Parameters]) -> tuple[Parameters, Kept] | None:
     """Return parameters and the poses (n,) that agree with them, by a robust fit from several starts.
 
-    `weights` (n, 6, 6) are inverse noise covariances. The result is None if all starts leave fewer than `fewest_kept`.
+    `weights` (n, 6, 6) are inverse noise covariances. None if, from every start, fewer poses agree than `fewest_kept`.
     """
     phi, wrench = features(descent.R), descent.wrench
 
@@ -345,7 +345,7 @@ def agreeing_poses(descent: Descent, weights: Array, starts: Sequence[Parameters
     for start in starts:
         p = start
         d2 = squared_distances(p)
-        # The cost is convex at first. As it becomes less convex, outliers lose their weight.
+        # The robust cost is convex at first. It is then made less convex in steps, and outliers lose their weight.
         softness = max(1.0, 2 * float(d2.max()) / FARTHEST)
         while softness > 1:
             soft = softness * FARTHEST

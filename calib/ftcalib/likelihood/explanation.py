@@ -60,9 +60,9 @@ from ftcalib.model import Array, Parameters, predict
 
 # Selection of the components: forward, backward and by exchange.
 
-# Change of the log-likelihood that no other component can compensate.
+# A component that changes the log-likelihood by more is certain: no other component can compensate its absence.
 SURE = 20.0
-# Smallest gain, predicted from score and information at zero, of a component that is tried.
+# A component is tried if the log-likelihood gain predicted for it, from score and information at zero, exceeds this.
 WORTH_A_TRY = 1.0
 USUAL_HYSTERESIS = 0.001
 # Standard deviations of gain and cross-talk of real sensors: a small one, and the usual one.
@@ -156,7 +156,7 @@ def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
         len(problem.r) * max(best.theta[k] for k in walks if any(best.components[k].share[c] for c in g))
         for g in groups
     ]
-    # Without the walk the white noise is larger.
+    # Without the random walk, white noise has to explain its share too.
     noise = [
         best.theta[k] + sum(best.theta[w] for w in walks if np.dot(best.components[w].share, best.components[k].share))
         for k in rest
@@ -187,7 +187,7 @@ def _prune(problem: Linearised, best: Point, needed: int) -> Point:
     while k < len(best.components):
         rest = [i for i in range(len(best.components)) if i != k]
         components, theta = [best.components[i] for i in rest], best.theta[rest]
-        without = point(best.problem, components, theta, best)  # other variances may compensate part of the loss
+        without = point(best.problem, components, theta, best)  # others may compensate the loss in part
         if best.loglik - without.loglik < SURE:
             without = maximise(problem, components, theta, best.loglik - best.components[k].needed)
         if without.worth > best.worth:
@@ -198,7 +198,7 @@ def _prune(problem: Linearised, best: Point, needed: int) -> Point:
 
 
 def _predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:
-    """Return the predicted gain in log-likelihood (k,) of each candidate alone, and initial variances (k,)."""
+    """Return the log-likelihood gain (k,) predicted for adding each candidate alone, and initial variances (k,)."""
     start = unit_variances(problem, best, waiting)
     components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * start])
     problem = problem.with_only(components)
@@ -220,14 +220,14 @@ def _predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Compone
 
 
 def _where_all_are_seen(problem: Linearised, best: Point, components: Sequence[Component], theta: Array) -> Point:
-    """Return a point equivalent to the best one at which the score of further components can be evaluated."""
+    """Return the best `Point` in a form at which the score of the further `components` can be evaluated."""
     if best.own.walks:
         return point(problem, components, theta)
     return best if best.problem is problem else point(problem, best.components, best.theta)
 
 
 def rivals(problem: Linearised, best: Point, candidates: Sequence[Component]) -> list[tuple[Point, float]]:
-    """Return rival models that the data do not exclude, with their probabilities; `best` has the rest.
+    """Return rival models that the data do not exclude, with their probabilities; the remaining one is that of `best`.
 
     The rivals are: all candidates that were not selected, with variances from score and information at zero; gain and
     cross-talk with equal variances; hysteresis instead of orientation errors; no drift, or white noise instead.
@@ -275,7 +275,7 @@ def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) ->
     return point(problem, [*best.components, *chosen], np.append(best.theta, variances))
 
 
-# With more poses than this, single poses are examined only if chi2 or `drift` requires it.
+# With more poses than this, outliers are searched for only if chi2 or the setting `drift` requires it.
 MANY_POSES = 20_000
 # Size of the subset of more than 1000 poses that is searched for walks and structured errors.
 SEARCHED = 300
@@ -283,7 +283,7 @@ SEARCHED = 300
 POSES_FOR_THE_SHAPE = 500
 # P-value of chi2 below which components are searched for.
 SUSPICIOUS = 0.01
-# Ratio of median to mean of the squared distances, relative to that of Gaussian noise.
+# Ratio of median to mean of the squared Mahalanobis distances, relative to Gaussian noise; less suggests outliers.
 LIGHT_TAIL = 0.6
 # Largest number of iterations of the outer loop.
 ROUNDS = 20
@@ -305,7 +305,7 @@ class Explanation:
     criterion: float = np.inf
     """-2 log restricted likelihood plus the penalties of components and rejected poses."""
     noticed: bool = False
-    """Whether outliers may still be among the kept poses."""
+    """Whether the kept poses may still contain outliers, so that the search should also start from a robust fit."""
     noise: Noise | None = None
     """Noise model at `parameters`."""
 
@@ -316,7 +316,7 @@ class Explanation:
 
 
 def explain(session: SessionData) -> tuple[Explanation, list[Minimum], float]:
-    """Return the best explanation, its minima in ascending order, and chi2 of its poses without components."""
+    """Return the best explanation, its minima by ascending chi2, and chi2 of its poses without variance components."""
     weights = inverses(session.cov if session.measured else np.broadcast_to(white(1.0, LEVER_M), session.cov.shape))
     minima = session.once("minima", lambda: session.descent.minima(weights))
     plain = Explanation(minima[0].parameters, session.everything)
@@ -438,7 +438,7 @@ def _improve(session: SessionData, p: Parameters, kept: Kept) -> Explanation:
             continue
         if ends or (tried and set(at.components) == chosen):
             break
-        # Components that the compensation models are tried first, because structured errors would displace them.
+        # What the compensation models (gain, cross-talk, drift) is tried first: structured errors would displace it.
         tried = True
         again = select_explanation(problem, at.components, at.theta, [*candidates, *structure], len(always))
         if set(again.components) == set(at.components):
@@ -457,7 +457,7 @@ def _first_explanation(session: SessionData, p: Parameters, kept: Kept) -> tuple
 def _improve_once(
     session: SessionData, best: Explanation, p: Parameters, problem: Linearised, at: Point
 ) -> tuple[Explanation, Parameters, Linearised, Point, bool]:
-    """Improve all but the choice of further components; the last result is whether the search may stop."""
+    """Improve all but the choice of further components; the last value returned tells whether the search may stop."""
     candidates, needed, kept = session.candidates(), len(session.always()), problem.kept
     at = _with_response_instead(problem, at, candidates, needed)
     if session.drift == "auto":
@@ -491,7 +491,7 @@ def _settle(
         p = session.descent.down(session.statistics(at.noise, p), p).parameters
         problem = session.linearise(p, kept)
         at = maximise(problem, at.components, at.theta)
-        if at.squared_step < SETTLED and not kept.all():  # drop components that only rejected poses needed
+        if at.squared_step < SETTLED and not kept.all():  # drop components needed only for rejected poses
             at = select_explanation(problem, at.components, at.theta, (), len(session.always()))
     return p, problem, at
 
@@ -559,7 +559,7 @@ def _are_gaussian(session: SessionData, distances: Array) -> bool:
 
 
 def _stand_out(session: SessionData, distances: Array) -> bool:
-    """Whether some poses are outliers, or so many that no single one stands out."""
+    """Whether there are outliers among the poses: single ones, or so many that no single one stands out."""
     if session.n < FEWEST_TO_REJECT_FROM:
         return False
     tail = float(np.median(distances)) / MEDIAN_DISTANCE / (float(distances.mean()) / 6)

@@ -37,13 +37,13 @@ from ftcalib.likelihood.variance_components import (
 from ftcalib.model import BIASES, STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters, jacobian, predict
 from ftcalib.sensor_matrix import SIZE, Calibrated, Response, sensor_columns
 
-# Difference in the criterion above which structured errors are certain; real ones give 250 or more in 24 poses.
+# If structured errors lower the criterion by more than this, they are certain; real ones give 250 or more in 24 poses.
 _SURE = 40.0
-# Significant difference between two leave-one-out errors, as the logarithm of their mean squares.
+# Significant difference between the logarithms of two mean square leave-one-out errors.
 _CLEARLY = 0.05
-# Smaller mean squares are rounding errors of data without noise.
+# Leave-one-out mean squares below this value are rounding errors of data without noise.
 _EXACT = 1e-18
-# Components that the compensation does not model.
+# Variance components whose effect the compensation cannot subtract.
 UNCOMPENSATED = (HYSTERESIS, *STRUCTURE)
 
 
@@ -174,7 +174,7 @@ class Fit(Estimate):
     """Hysteresis and structured errors (n, 6) of each pose with their variance (n, 6, 6), which the compensation does
     not model; None if there are none."""
     at: Point | None
-    """Restricted likelihood at the solution; None for many poses."""
+    """Restricted likelihood at the solution; None for many poses, to save memory."""
 
     @property
     def wrench_cov(self) -> Array:
@@ -191,7 +191,7 @@ class Fit(Estimate):
             R = self.R_base_flange[rows]
             r = self.wrench[rows] - predict(self.on_average, R)
             WX = noise.solve(np.concatenate([jacobian(self.parameters, R), r[..., None]], axis=2))
-            # With a prior, J' W r is not zero at the best parameters.
+            # With a prior, the gradient J' W r of the data is not zero at the best parameters.
             e[rows], S[rows] = left_out(noise, WX[..., :15], WX[..., 15], self.given_noise)
         if self.lag is not None:
             e, S = e + self.lag[0], S + self.lag[1]
@@ -315,7 +315,7 @@ def fit(
 
 
 def _beside(found: Fit, other: Fit) -> Fit:
-    """Return a fit whose covariance includes another fit that is equally probable."""
+    """Return a fit with a covariance enlarged to include a second fit that is equally probable."""
     off, Z = found.parameters.difference(other.parameters), found.free
     more = Z.T @ (other.covariance - found.covariance + np.outer(off, off)) @ Z / 2
     scale = column_scale(Z.T @ found.covariance @ Z)
@@ -356,7 +356,7 @@ def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_
     measured_chi2 = static_chi2 if session.measured else float("nan")
     if found or drifts or session.n <= STRUCTURED_POSES:
         problem = session.linearise(best.parameters, e.kept)
-        if drifts:  # the result has the bias at the end
+        if drifts:  # the estimates contain the bias at the end of the session
             problem = replace(problem, origin=int(np.flatnonzero(e.kept)[-1]))
         at = point(problem, e.components, e.theta)
     if session.measured and found.keys() & {*RESPONSE}:
@@ -435,7 +435,7 @@ def _drift_result(
     others = [(problem.columns(c), value) for c, value in found.items() if c in (*RESPONSE, *UNCOMPENSATED)]
 
     def not_drift(X: Array) -> Array:
-        """Return the covariance of all components except the drift, times X."""
+        """Return the product of X and the noise covariance of all variance components except the drift."""
         Y = np.asarray(noise.D @ X)
         for columns, value in others:
             T = problem.X[..., columns]

@@ -261,12 +261,12 @@ def _quartic(Q: Array) -> tuple[Array, float]:
     """
     if Q.shape != (9, 9) or not np.isfinite(Q).all():
         raise ValueError(f"the cost matrix needs 9x9 finite numbers, not {Q.tolist()}")
-    excess = Q - np.trace(Q) / 9 * np.eye(9)  # r @ r = 3 for every rotation
+    excess = Q - np.trace(Q) / 9 * np.eye(9)  # adds a constant, because r @ r = 3 for every rotation
     form = (_R_OF_Q.T @ excess @ _R_OF_Q).reshape(4, 4, 4, 4)
     form = (form + form.transpose(0, 1, 3, 2)) / 2
     form = (form + form.transpose(1, 0, 2, 3)) / 2
     tensor = (form + form.transpose(0, 2, 1, 3) + form.transpose(0, 3, 2, 1)) / 3
-    variation = max(float(np.linalg.norm(tensor)), 1e-8 * abs(np.trace(Q))) or 1.0  # less is rounding
+    variation = max(float(np.linalg.norm(tensor)), 1e-8 * abs(np.trace(Q))) or 1.0  # a floor for rounding
     return tensor.reshape(16, 16) / variation, variation
 
 
@@ -316,7 +316,7 @@ def _descend(quartic: Array, q: Array) -> tuple[Array, Array, Array]:
         near = np.abs(here[0] @ here[0].T) > 1 - 1e-6
         same = (near.argmax(axis=1) < np.arange(len(near))) & (
             curvature[:, 0] > 0
-        )  # another start converges to this minimum
+        )  # give up this start: another one converges to the same minimum
         if done.any():
             ends.append(tuple(x[done] for x in here[:4]))
         if (gone := done | same).any():

@@ -56,13 +56,13 @@ FEW_POSES_WITHOUT_NOISE = 12
 FEW_POSES_FOR_HYSTERESIS = 12
 # With fewer poses than this, the axes of a group share one drift.
 POSES_FOR_EACH_AXIS = 50
-# Largest residuals of a fit to data without noise, in units of the rounding error.
+# Residuals up to this multiple of the rounding error mean that the data have no noise.
 EXACT = 100
-# Ratio of the low-discrepancy sequence that selects a subset of poses.
+# Constant of the low-discrepancy sequence with which a subset of the poses is selected.
 GOLDEN_RATIO = (1 + 5**0.5) / 2
 # Smallest assumed ratio of force to torque residuals or the reverse, in units of their usual ratio.
 UNEQUAL = 0.01
-# Noise floor, as a share of the residuals, if the noise was not measured.
+# Smallest white noise, as a share of the residuals, if the noise was not measured.
 FLOOR = 1e-3
 
 
@@ -104,7 +104,7 @@ class SessionData:
         self._done = dict[object, Any]()
 
     def once(self, key: object, call: Callable[[], _T]) -> _T:
-        """Return the result of a call, cached if a second explanation without structured errors may repeat it."""
+        """Return the result of `call`. It is cached if a second fit, without structured errors, may repeat the call."""
         value: _T = self._done[key] if key in self._done else call()
         if self.structure():
             self._done[key] = value
@@ -124,7 +124,7 @@ class SessionData:
 
     def is_exact(self, p: Parameters) -> bool:
         """Whether the residuals are only rounding errors or, if the noise is unknown, below the sensor's resolution."""
-        first_poses, all_poses = slice(1000), slice(None)  # the first poses usually decide
+        first_poses, all_poses = slice(1000), slice(None)  # the first poses usually decide, and are checked faster
         return self._fits_exactly(p, first_poses) and self._fits_exactly(p, all_poses)
 
     def _fits_exactly(self, p: Parameters, poses: slice) -> bool:
@@ -145,13 +145,13 @@ class SessionData:
         return np.broadcast_to(white(*np.maximum(sigma, _rounding(self.wrench))), self.cov.shape)
 
     def _rms(self, p: Parameters) -> Array:
-        """Return the rms residuals (2,) of force and torque, with a lower bound of each relative to the other."""
+        """Return the rms residuals (2,) of force and torque; each is at least a small multiple of the other."""
         e = (self.wrench - predict(p, self.R)).reshape(-1, 2, 3)
         rms = np.sqrt(np.mean(e**2, axis=(0, 2)))
         return np.asarray(np.maximum(rms, UNEQUAL * rms[::-1] * [1 / LEVER_M, LEVER_M]))
 
     def start(self, problem: Linearised, components: Sequence[Component]) -> Array:
-        """Return initial variances: the mean square residual of the group, or its noise if that is larger."""
+        """Return an initial variance per component: mean square residual of its channels, or their noise if larger."""
         if not components:
             return np.zeros(0)
         noise = np.diagonal(problem.D, axis1=1, axis2=2)
@@ -196,7 +196,7 @@ class SessionData:
         return self.gain_sigma > 0 and self.n < FEW_POSES_FOR_GAIN
 
     def always(self) -> list[Component]:
-        """Return the components that are always part of the model."""
+        """Return the variance components that are part of the noise model whatever the data show."""
         always = []
         if not self.measured and self.n < FEW_POSES:
             always = [Component("white_force_N", "white", (1.0, 1.0, 1.0, *[LEVER_M**2] * 3))]
@@ -209,7 +209,7 @@ class SessionData:
         return always
 
     def candidates(self) -> list[Component]:
-        """Return the components that are added if they increase the likelihood enough."""
+        """Return the variance components that are added to the model if they increase the likelihood enough."""
         found = list(RESPONSE) if self.n >= FEW_POSES_FOR_RESPONSE and not self.assumes_response else []
         if self.n >= (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
             white = [channel_component("white", FORCE), channel_component("white", TORQUE)] if self.measured else []
@@ -222,14 +222,14 @@ class SessionData:
         return found
 
     def structure(self) -> tuple[Component, ...]:
-        """Return the structured errors that are added if they increase the likelihood enough."""
+        """Return the structured errors that are added to the model if they increase the likelihood enough."""
         if not self.structured or self.n < FEW_POSES_FOR_HYSTERESIS:
             return ()
         return STRUCTURE if self.n <= STRUCTURED_POSES else tuple(c for c in STRUCTURE if c in (self.shown or ()))
 
     def some(self, count: int) -> "SessionData":
-        """Return the session of a subset of `count` poses, one from each of `count` parts of equal length."""
-        # The places within the parts vary, because a tour may have been repeated with the period of the parts.
+        """Return a session with `count` of the poses: one from each of `count` successive parts of equal length."""
+        # The position within the parts varies, because a tour may have been repeated with the period of the parts.
         k = np.arange(count)
         places = ((k + k * GOLDEN_RATIO % 1) * self.n / count).astype(np.intp)
         R, wrench = (x[self.order[places]] for x in self.given)

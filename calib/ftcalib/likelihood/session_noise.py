@@ -89,7 +89,7 @@ class Noise:
             yield part, Noise(self.D[part], kept=self.kept[part])
 
     def _add_walk(self, dt: Array, origin: int | None) -> None:
-        """Factorise M = K^+ + S W S, unknowns ordered by pose, then channel; then constrain mean or origin to zero."""
+        """Add the walk: factorise M = K^+ + S W S, ordered by pose, then channel; constrain mean or origin to zero."""
         n, k, s = self.n, self._walking.size, self._s
         stiffness = 1 / dt
         blocks = s[:, None] * self.W[:, self._walking[:, None], self._walking] * s
@@ -109,11 +109,11 @@ class Noise:
         Q = self.W[:, :, self._walking] @ (s[:, None] * M_zero)
         self._low_rank.append((Q, np.linalg.inv(total)))
         self._logdet += 2 * float(np.log(self._cholesky[-1]).sum()) + float(np.linalg.slogdet(total)[1])
-        # Log-determinant of the walk with one combination fixed.
+        # Log-determinant of the random walk whose mean or origin is fixed at zero.
         self._logdet += k * (float(np.log(dt).sum()) - 2 * float(np.log(n if origin is None else 1)))
 
     def add_effects(self, T: Array, variance: Array) -> None:
-        """Add coefficients common to all poses: their columns T (n, 6, k) and variances (k,)."""
+        """Add k random coefficients common to all poses to the noise: their columns T (n, 6, k) and variances (k,)."""
         Q = self.solve(T)
         core = np.diag(1 / variance) + summed_products(T, Q)
         self._low_rank.append((Q, -np.asarray(np.linalg.inv(core), dtype=np.float64)))
@@ -160,7 +160,7 @@ class Noise:
 
     @property
     def walks(self) -> bool:
-        """Whether the bias of any channel is a random walk."""
+        """Whether the noise contains a random walk of the bias in any channel."""
         return self._walking.size > 0
 
     def walk_trace(self, time: Array, channels: NDArray[np.intp], low_rank: tuple[Array, Array]) -> float:
@@ -182,7 +182,7 @@ def inverse_blocks(diagonal: Array, above: Array) -> tuple[Array, Array]:
         return np.asarray(np.linalg.inv(diagonal)), above
     inverse, beside = np.empty_like(diagonal), np.empty_like(above)
     before, after, own = above[::2], above[1::2], np.linalg.inv(diagonal[1::2])
-    k = len(after)  # the last of the eliminated blocks may have none after it
+    k = len(after)  # the last eliminated block may have no right neighbour
     left, right = own @ _transposed(before), own[:k] @ after
     rest = diagonal[::2].copy()
     rest[: len(own)] -= before @ left

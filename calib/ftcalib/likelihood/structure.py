@@ -119,7 +119,7 @@ def error_with_other_joints(parameters: Parameters, orientation_rad: float) -> A
     joints half of its variance, and the smooth errors of both places, are different. Arguments as in `hidden_columns`.
     """
     turn_rad = orientation_rad * np.sqrt(_OF_BASE**2 / 2 + 2 * _SMOOTH**2)
-    force_N = parameters.weight_N * turn_rad * np.sqrt(2.0)  # two axes across the weight
+    force_N = parameters.weight_N * turn_rad * np.sqrt(2.0)  # rotations about the two axes perpendicular to gravity act
     return np.asarray(force_N * np.array([1.0, np.sqrt(2 / 3) * np.linalg.norm(parameters.p_sensor_com_m)]))
 
 

@@ -35,15 +35,15 @@ from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.session_noise import Noise, centre, summed_products, walk_times
 from ftcalib.model import Array
 
-# Smallest gain in restricted log-likelihood of a component that is kept; 2 % of absent components pass by chance.
+# Smallest gain in restricted log-likelihood for keeping a component; 2 % of absent components pass by chance.
 GAIN = 2.0
 # Smallest gain of components with several coefficients, such as gain and cross-talk; 0.4 % pass by chance.
 GAIN_OF_RESPONSE = 3.0
 # Convergence: squared distance to the maximum, in standard deviations of the log variances.
 SETTLED = 1e-2
-# Levenberg-Marquardt damping that noticeably shortens a step.
+# Levenberg-Marquardt damping above which a step is noticeably shortened.
 CAREFUL = 0.3
-# Largest possible gain of an ascent, relative to the quadratic prediction from score and information.
+# Upper bound of what an ascent can still gain, as a multiple of the quadratic prediction from score and information.
 HOPE = 10.0
 # Variance, relative to the white noise, at which score and information of an absent component are evaluated.
 NEGLIGIBLE = 1e-4
@@ -61,7 +61,7 @@ POSES_THAT_SHOW_THE_NOISE = 1000
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 
 Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk", "hysteresis", "load", "cable", "kinematics"]
-# Kinds with coefficients common to all poses, except a slope.
+# Kinds of variance components whose coefficients are common to all poses, except the slope of a drift.
 EFFECTS = ("gain", "cross_talk", "hysteresis", "load", "cable", "kinematics")
 
 
@@ -159,7 +159,7 @@ class Linearised:
         return {kind: np.arange(ends[k], ends[k + 1]) for k, kind in enumerate(self.effects)}
 
     def columns(self, c: Component) -> NDArray[np.intp] | None:
-        """Return the columns of `X` with this variance; None for a component without common coefficients."""
+        """Return the indices of a component's columns of `X`; None if it has no coefficients common to all poses."""
         m = self.J.shape[2]
         if c.kind == "slope":
             return np.asarray(m + np.flatnonzero(c.share))
@@ -169,14 +169,14 @@ class Linearised:
         return np.asarray(places.reshape(6, -1)[np.array(c.share) > 0].ravel())
 
     def size(self, c: Component) -> float:
-        """Return the number of independent random numbers with this variance."""
+        """Return the number of independent random numbers that have the variance of this component."""
         columns = self.columns(c)
         if columns is not None:
             return float(len(columns))
         return int(self.kept.sum()) * (2.0 if c.kind == "rotation" else float(np.count_nonzero(c.share)))
 
     def largest(self, c: Component) -> float:
-        """Return the upper bound of the variance for an arm and a sensor in working order.
+        """Return the upper bound of a component's variance for an arm and a sensor in working order.
 
         A gain error also changes the torque of the weight, like cross-talk at the lever of the centre of mass.
         """
@@ -184,7 +184,7 @@ class Linearised:
         return LARGEST.get(c.kind, np.inf) * at_lever
 
     def smallest(self, c: Component) -> float:
-        """Return the lower bound of the variance; 0 if there is none."""
+        """Return the lower bound of a component's variance; 0 if it has none."""
         return self.least.get(c.kind, 0.0)
 
 
@@ -196,7 +196,7 @@ class Point:
     components: tuple[Component, ...]
     theta: Array
     of_poses: list[tuple[Component, float]]
-    """Components with their variances, without those that have common coefficients."""
+    """Components with their variances, except the components with coefficients common to all poses."""
     own: Noise
     """Covariance of the measured noise and of the components in `of_poses`."""
     WX: Array
@@ -297,7 +297,7 @@ def left_out(noise: Noise, WJ: Array, u: Array, C: Array) -> tuple[Array, Array]
     """
     P = noise.blocks - WJ @ C @ np.swapaxes(WJ, 1, 2)
     rejected = ~noise.kept
-    P[~rejected] += 1e-10 * noise.W[~rejected]  # however badly the others determine it
+    P[~rejected] += 1e-10 * noise.W[~rejected]  # stays invertible even if the other poses do not determine this one
     S = np.linalg.inv(P)
     e = (S @ u[..., None])[..., 0]
     if rejected.any():
@@ -398,7 +398,7 @@ def score(problem: Linearised, at: Point, components: Sequence[Component], theta
     slope, Vu, E = np.empty(len(components)), np.empty((*u.shape, len(of_poses))), np.zeros((len(G), len(components)))
     for k, (c, variance) in enumerate(zip(components, theta, strict=True)):
         columns = problem.columns(c)
-        if columns is not None:  # moments of the coefficients
+        if columns is not None:  # the component has common coefficients: use their moments
             along = G[columns, -1] - G[np.ix_(columns, at.unknown)] @ at.x
             between = G[np.ix_(columns, at.unknown)]
             trace = float(np.trace(G[np.ix_(columns, columns)]) - np.vdot(between, between @ C))
@@ -462,7 +462,7 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array,
             # Levenberg-Marquardt: average information is the curvature only near the best variances.
             damped = information + np.diag(caution * (np.diag(information) + 1e-3))
             step = np.clip(np.linalg.solve(damped, slope), -2.5, 2.5)
-            if caution < CAREFUL:  # far below the optimum an expectation-maximisation step is longer
+            if caution < CAREFUL:  # far from the optimum the EM step is longer
                 step = np.where(slope > 0, np.maximum(step, np.log1p(2 * np.maximum(slope, 0) / size)), step)
             trial = point(problem, components, np.clip(best.theta * np.exp(step), least, most))
             gained = trial.loglik - best.loglik
@@ -473,7 +473,7 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array,
             best, caution = trial, max(caution / 10, 1e-6)
         if gained < 1e-3 or (gained < 1e-2 and np.abs(step).max() < 0.05):
             break
-        # A variance that decreases without changing the likelihood is dropped later.
+        # Stop if only variances decrease, without effect on the likelihood: their components are dropped later.
         if gained < 1e-2 and (slope < 0.05).all():
             break
     return best

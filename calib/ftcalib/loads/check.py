@@ -12,7 +12,7 @@ from ftcalib.model import Array, cross
 from ftcalib.result import CalibrationResult
 from ftcalib.sensor_matrix import Calibrated
 
-# Largest error within the promised accuracy, in sigmas.
+# Errors up to this many sigmas are within the promised accuracy of the sensor.
 _WITHIN = 2.0
 
 
@@ -31,7 +31,7 @@ class LoadCheck(NamedTuple):
     off_vertical_rad: float
     """Angle between force and gravity, mean over the poses, rad."""
     off_m: float
-    """Distance of the line of action from the position of the load, m; NaN if no position is given."""
+    """Distance of the measured line of action from the declared position of the load, m; NaN if none is declared."""
     off_sigma_m: float
 
     @property
@@ -41,7 +41,7 @@ class LoadCheck(NamedTuple):
 
     @property
     def is_significant(self) -> bool:
-        """Whether the error is significant."""
+        """Whether the error exceeds its own uncertainty significantly."""
         return abs(self.scale_error) > _WITHIN * self.scale_sigma
 
     def to_dict(self) -> dict[str, JSON]:

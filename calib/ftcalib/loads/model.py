@@ -86,13 +86,13 @@ class Mistake:
 
     kind: Kind
     run: int = 0
-    """Index of the run; unused for the mass of the tool."""
+    """Index of the run with the mistake; unused if the mistake is the mass of the tool."""
     pose: int = 0
-    """Index of the first pose after a change, or of the touched pose."""
+    """Index of the pose: the first after a change, or the one in which the tool was touched."""
 
     @property
     def sigma(self) -> Array:
-        """Prior standard deviations of the free quantities, kg, m, N or N·m."""
+        """Prior standard deviations of the additional free quantities, kg, m, N or N·m."""
         return np.array(_MISTAKES[self.kind])
 
 
@@ -137,7 +137,7 @@ class Evaluated:
     covariance: Array
     """(k, k) covariance of all unknowns."""
     unexplained: list[tuple[Array, Array]]
-    """Weighted residual (6n,) of each run, and its covariance (6n, 6n) under the model."""
+    """For each run, its weighted residual (6n,) and the covariance (6n, 6n) of that under the model."""
 
     def gain_of(self, run: int, columns: Array, sigma: Array) -> float:
         """Return the cost reduction from further quantities with derivatives (6n, m) and priors `sigma` in one run."""
@@ -176,7 +176,7 @@ class LoadModel:
         names += [f"load {k}" for k in range(len(self.loads))] + [f"bias {k}" for k in range(len(self.runs))]
         ends = np.cumsum(sizes).tolist()
         self.at = {name: slice(end - size, end) for name, size, end in zip(names, sizes, ends, strict=True)}
-        # The value of the rotation stays 0, because its steps are applied to R.
+        # The rotation is stored in R, to which steps are applied; its entry in the vector of unknowns stays 0.
         self.x, self.expected, sigma = np.zeros(ends[-1]), np.zeros(ends[-1]), np.ones(ends[-1])
         mass_kg, com_m = tool
         self._set("matrix", prior.error.ravel())
@@ -194,14 +194,14 @@ class LoadModel:
         for k in range(len(self.runs)):
             sigma[self.at[f"bias {k}"]] = _ANY_BIAS
         self.information = np.diag(sigma**-2.0)
-        # Only the matrix has an informative prior; the mounting may have changed.
+        # Of the prior only the sensor's matrix is used, because the mounting may have changed since.
         self._matrix_information = np.linalg.inv(prior.covariance[3:, 3:])
 
     def _set(self, name: str, values: Array) -> None:
         self.x[self.at[name]] = self.expected[self.at[name]] = values
 
     def with_mistake(self, mistake: Mistake) -> "LoadModel":
-        """Return a copy with one more mistake, at the current values."""
+        """Return a copy of the model that allows for one more mistake, at the current values of the unknowns."""
         other, size = copy(self), len(mistake.sigma)
         end = len(self.x)
         other.at = {**self.at, f"mistake {len(self.mistakes)}": slice(end, end + size)}
@@ -273,7 +273,7 @@ class LoadModel:
         return bool(self.information[self.at["tool"].start, self.at["tool"].start] > _ANY_KG**-2.0)
 
     def load_of(self, run: int) -> int:
-        """Return the index in `loads` of the load of a run."""
+        """Return the index in `loads` of the load that a run has on the tool."""
         return sum(earlier.load is not None for earlier in self.runs[:run])
 
     def columns_of(self, mistake: Mistake, run: int, J: Array, readout: Array) -> Array:

@@ -22,10 +22,10 @@ from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.sensor_matrix import SensorMatrix, ranges
 from ftcalib.solver import solve
 
-# Required reduction of -2 log likelihood due to a mistake, in addition to `_penalty`.
+# A mistake must reduce -2 log likelihood by this much, in addition to `_penalty`.
 _CLEARLY = 12.0
 _MOST_MISTAKES = 4
-# Largest number of candidate mistakes that are fitted completely.
+# Number of candidate mistakes, the most promising ones, for which the whole fit is repeated.
 _TRIED = 4
 # Largest residual of a linear sensor, as a share of the load.
 _MOST_REMAINING = 0.03
@@ -44,9 +44,9 @@ class LoadSolution(Displayed):
     loads: tuple[Mapping[str, JSON], ...]
     """Estimates for each run with a load: `run`, `name`, `mass_kg`, `mass_sigma_kg`, `p_flange_m`, `p_sigma_m`."""
     sizes: Mapping[str, float]
-    """Standard deviations of the disturbances, by name and unit."""
+    """Estimated standard deviations of the disturbances of the readings, by name and unit."""
     remaining: tuple[float, ...]
-    """Rms residual of each run, relative to the load in units of the ranges."""
+    """Rms residual of each run, relative to its load; force and torque are in units of the measuring ranges."""
     tool_mass_kg: float
     tool_mass_sigma_kg: float
 
@@ -217,7 +217,7 @@ def _best_mistake(
 
     Each fit starts from the initial model, because a fit without the mistake may be far from the solution.
     """
-    # A mistake increases the sizes of the disturbances, which would hide the mistake.
+    # The sizes are estimated with the mistake, because without it they grow and hide it.
     usual, linear = np.minimum(logarithms, 0.0), model.linear()
     plain = model.evaluate(usual, linear)
     gains: dict[Mistake, float] = {}
@@ -241,7 +241,7 @@ def _best_mistake(
 
 
 def _most(gains: Mapping[Mistake, float]) -> list[Mistake]:
-    """Return the candidates to fit: the best of each kind and run, if its predicted gain is sufficient."""
+    """Return the candidate mistakes to fit: the best of each kind and run, if its predicted gain is sufficient."""
     best: dict[str, Mistake] = {}
     for mistake in sorted(gains, key=lambda candidate: -gains[candidate]):
         if gains[mistake] > _CLEARLY:
@@ -250,7 +250,7 @@ def _most(gains: Mapping[Mistake, float]) -> list[Mistake]:
 
 
 def _penalty(mistake: Mistake, model: LoadModel) -> float:
-    """Return the additional gain required of a mistake that could be in any pose."""
+    """Return the additional gain required of a mistake because it could be in any of the poses."""
     per_pose = mistake.kind in ("touched", "bumped", "moved")
     return 2 * float(np.log(len(model.runs[mistake.run].dataset))) if per_pose else 0.0
 

@@ -184,7 +184,7 @@ def units(unit_codes: tuple[int, int]) -> tuple[float, float]:
 
 
 def parse_units(text: str) -> tuple[int, int]:
-    """Return the unit codes of an option such as ``lbf,lbf-in``. Raises `ValueError`."""
+    """Return the unit codes of an option such as ``lbf,lbf-in``. Raises `ValueError` for an unknown unit."""
     force, _, torque = text.partition(",")
     if force not in _FORCES or torque not in _TORQUES:
         raise ValueError(

@@ -60,7 +60,7 @@ class Ros2Arm(ReadOnlyArm):
         clock: Clock = REAL,
     ) -> None:
         self._host, self._model, self._clock = host, model, clock
-        self._reader = pose_reader_of(host)  # this also rejects wrong options
+        self._reader = pose_reader_of(host)  # rejects a wrong address early
         self._ros: Node | None = None
         self._publishers: dict[str, str] = {}
         self._single: list[OnePublisher] = []
@@ -71,7 +71,7 @@ class Ros2Arm(ReadOnlyArm):
         self._failure: ProtocolError | None = None
 
     def open(self, *, control: bool = False) -> None:
-        """Subscribe and wait for the first pose. Raises `ConnectError`, always if control is requested."""
+        """Subscribe and wait for the first pose. Raises `ConnectError` if none arrives, or if control is requested."""
         super().open(control=control)
         if self._ros is not None:
             if self._failure is None and self._age_s() < _STALE_S:
@@ -161,7 +161,7 @@ class Ros2Arm(ReadOnlyArm):
         )
 
     def state(self) -> ArmState:
-        """Return a state that arrives after this call. Raises `DeviceTimeout`."""
+        """Return a state that arrives after this call. Raises `DeviceTimeout` if no message arrives in time."""
         with self._changed:
             before = self._newest
             for left_s in self._clock.looks(_STALE_S):
@@ -225,7 +225,7 @@ class Ros2Arm(ReadOnlyArm):
 
 
 def _speed(before: StampedPose, after: StampedPose) -> float:
-    """Return the speed of the flange between two poses, rad/s; 0 if both are the same pose."""
+    """Return the speed of the flange between two poses, rad/s; 0 if they do not have ascending time stamps."""
     dt_s = 1e-9 * (after.t_ns - before.t_ns)
     if dt_s <= 0:
         return 0.0
@@ -242,7 +242,7 @@ def _no_states() -> ArmStates:
 
 
 def pose_reader_of(host: str) -> PoseReader:
-    """Return the reader that converts messages to poses for an address. Raises `BadUrl`."""
+    """Return the reader that converts messages to poses for an address. Raises `BadUrl` for an invalid address."""
     parts = split_url(host)
     options = Options(host, parts.query)
     address = parts.address.strip("/")

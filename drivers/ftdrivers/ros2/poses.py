@@ -118,7 +118,7 @@ def _numbers(text: str) -> Array:
 
 UNIT_TOLERANCE: Final = 1e-3
 """Largest difference between the norm of a quaternion and 1."""
-# Largest difference between the stamps of the transforms in a chain.
+# Largest difference between the time stamps of the transforms from base to flange.
 _SPREAD_NS: Final = 100_000_000
 
 
@@ -137,14 +137,14 @@ class PoseReader(Protocol):
     """Message type of each topic."""
 
     def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
-        """Yield the poses that a message completes. Raises `ProtocolError`."""
+        """Yield the poses that a message completes. Raises `ProtocolError` for an invalid pose, joint or time stamp."""
 
     def missing(self) -> str:
-        """Return the reason why there is no pose yet."""
+        """Return a sentence that gives the reason why there is no pose yet."""
 
 
 def _pose_of(position: Any, quaternion: Any, what: str) -> tuple[Array, Array]:
-    """Return rotation matrix and position of a pose in a message. Raises `ProtocolError`."""
+    """Return rotation matrix and position. Raises `ProtocolError` if not finite, or if the quaternion is no unit."""
     p = position.x, position.y, position.z
     q = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     if not np.isfinite((*p, *q)).all():
@@ -166,7 +166,7 @@ class Poses:
         yield StampedPose(stamp_ns(message.header, topic), *pose)
 
     def missing(self) -> str:
-        """Return the reason: no message arrived."""
+        """Return a sentence: no message of the topic arrived."""
         return f"no message of {next(iter(self.topics))} arrived"
 
 
@@ -179,7 +179,7 @@ class Joints:
         self._seen: set[str] = set()
 
     def positions(self, topic: str, message: Any) -> dict[str, float] | None:
-        """Return the joint positions of the chain; None for a message of other joints. Raises `ProtocolError`."""
+        """Return the joint positions of the chain, None for other joints; raise `ProtocolError` if they are invalid."""
         if len(message.position) != len(message.name):
             raise ProtocolError(
                 f"a message of {topic} has {len(message.name)} names and {len(message.position)} positions",
@@ -200,7 +200,7 @@ class Joints:
             yield StampedPose(stamp_ns(message.header, topic), R[0], p[0])
 
     def missing(self) -> str:
-        """Return the joints that were missing in all messages."""
+        """Return a sentence naming the joints of the chain that were missing in all messages."""
         lacking = [name for name in self.chain.names if name not in self._seen]
         has = ", ".join(sorted(self._seen)) or "none"
         return f"no message of {next(iter(self.topics))} has all joints; missing {', '.join(lacking)}, found {has}"
@@ -247,7 +247,7 @@ class Transforms:
         yield StampedPose(oldest_ns, R, p)
 
     def _chain(self) -> list[tuple[str, int | None, Array, Array]] | None:
-        """Return the transforms from base to flange; None while one is missing."""
+        """Return the transforms from base to flange; None while one of them is missing."""
         chain: list[tuple[str, int | None, Array, Array]] = []
         frame = self._flange
         while frame != self._base:
@@ -258,7 +258,7 @@ class Transforms:
         return chain
 
     def missing(self) -> str:
-        """Return which frame or transform is missing."""
+        """Return a sentence naming the frame or transform that is missing."""
         frames = {*self._parts, *(parent for parent, *_ in self._parts.values())}
         for frame in (self._base, self._flange):
             if frame not in frames:

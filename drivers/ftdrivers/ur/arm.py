@@ -251,7 +251,7 @@ class UrArm(RobotArm):
         """Return whether the robot is in remote control, from the dashboard server or the Robot API.
 
         The result is None before PolyScope 5.6 and on PolyScope X before 10.12, which do not report it, and at the
-        addresses of URSim, which does not need remote control. Raises `NoDashboard`.
+        addresses of URSim, which does not need remote control. Raises `NoDashboard` if the server does not answer.
         """
         reader = self._reading()
         if reader.version[:2] < (5, 6) or self._host in SIMULATORS:

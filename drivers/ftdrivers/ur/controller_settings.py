@@ -35,7 +35,7 @@ _G_M_S2: Final = (8.0, 12.0)
 
 
 def read_controller_settings(host: str, *, timeout_s: float, clock: Clock) -> ControllerSettings:
-    """Read the settings once. Raises `ConnectError`, `DeviceTimeout`, `StreamBroken` or `ProtocolError`."""
+    """Read load and gravity once; failures raise ConnectError, DeviceTimeout, StreamBroken or ProtocolError."""
     # The connection is separate, because no source states the type of target_gravity, and a wrong type ends the
     # connection.
     stream = Subscription(host, OUTPUTS, _RATE_HZ, timeout_s=timeout_s, clock=clock)

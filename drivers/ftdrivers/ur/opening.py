@@ -123,7 +123,7 @@ class Opening:
     def open(self) -> Control:
         """Start the control program. Another program is never stopped, unless the same object started it.
 
-        Raises `ConnectError`, also if a safety stop prevents the start, and the exceptions of the reader.
+        Raises `ConnectError` if the start fails, for example in a safety stop, and the exceptions of the reader.
         """
         self._look_out()
         path, why = path_for(self.setting, self.reader.version)

@@ -246,7 +246,7 @@ def read_arm(host: str, *, timeout_s: float, clock: Clock) -> tuple[str | None, 
 
 
 def find_program_port(host: str, port: int, *, timeout_s: float) -> None:
-    """Check that the port for programs can be reached, without sending a program. Raises `ConnectError`."""
+    """Raise `ConnectError` if the port for programs cannot be reached. No program is sent."""
     try:
         socket.create_connection((host, port), timeout=timeout_s).close()
     except OSError as error:

@@ -338,9 +338,9 @@ def _fix_of(error: OSError, host: str) -> str:
 
 
 def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float, clock: Clock = REAL) -> list[str]:
-    """Return those of the inputs that belong to another client or a fieldbus. No input is changed.
+    """Return the names of those RTDE inputs that belong to another client or a fieldbus. No input is changed.
 
-    Raises `StreamBroken`, `DeviceTimeout` or `ProtocolError`.
+    Raises `StreamBroken` without a connection, `DeviceTimeout` without an answer, `ProtocolError` for an invalid one.
     """
     try:
         connection = _Connection(host, timeout_s, clock)

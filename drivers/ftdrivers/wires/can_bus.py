@@ -64,7 +64,7 @@ class CanBus:
         """Lines of an slcan adapter that are not frames."""
 
     def open(self) -> None:
-        """Join the bus. Raises `ConnectError`."""
+        """Join the bus. Raises `ConnectError` if the adapter is missing, is in use or does not open."""
         self.malformed = 0
         filters: list[can.typechecking.CanFilter] = [
             {"can_id": identifier, "can_mask": 0x7FF, "extended": False} for identifier in self._identifiers
@@ -121,7 +121,7 @@ class CanBus:
                 os.close(lock)
 
     def send(self, identifier: int, data: bytes) -> None:
-        """Send one data frame, which is lost if a busy adapter does not accept it in time. Raises `StreamBroken`."""
+        """Send one data frame; drop it silently if the adapter is too busy. Another failure raises `StreamBroken`."""
         if self._bus is None:
             raise StreamBroken(f"{self._owner}: the bus is closed", "open it first")
         timeout_s = self._clock.patience_s(_SEND_S)
@@ -134,7 +134,7 @@ class CanBus:
     def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
         """Wait for the next data frame of the device and return (identifier, data); None after the time-out.
 
-        Raises `StreamBroken`. It also blocks in an emulated cell, because many short waits would delay the polls.
+        Raises `StreamBroken` if the bus is lost. Blocks also in an emulated cell: many short waits would delay polls.
         """
         for left_s in self._clock.looks(timeout_s):
             if frame := self.look(left_s):
@@ -142,7 +142,7 @@ class CanBus:
         return None
 
     def look(self, wait_s: float) -> tuple[int, bytes] | None:
-        """Return the next data frame within `wait_s` of real time, at most 0.05 s, else None. Raises `StreamBroken`."""
+        """Return the next data frame within `wait_s`, at most 0.05 s; else None. A lost bus raises `StreamBroken`."""
         if self._bus is None:
             raise StreamBroken(f"{self._owner}: the bus is closed", "open it first")
         while True:
@@ -160,7 +160,7 @@ class CanBus:
                 return message.arbitration_id, bytes(message.data)
 
     def discard(self) -> None:
-        """Drop all received frames. Raises `StreamBroken`."""
+        """Drop all frames that have been received but not read. Raises `StreamBroken` if the bus is closed or lost."""
         if isinstance(self._bus, slcanBus):
             with contextlib.suppress(*BUS_ERRORS):  # the next `send` raises the error
                 self._bus.flush()  # faster than `recv`, which waits 1 ms for each missing frame
@@ -187,7 +187,7 @@ class CanBus:
 
 @dataclass(frozen=True, slots=True)
 class CanProbe:
-    """How to recognize one kind of sensor on a CAN bus."""
+    """Functions and identifiers with which a probe recognizes one kind of sensor on a CAN bus."""
 
     name: str
     url: str

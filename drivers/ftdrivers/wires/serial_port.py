@@ -50,7 +50,7 @@ def leave_marks_to_far_side(port: serial.Serial | int) -> None:
 
 
 _PLAIN: Final = re.compile(rb"(?:[^\xff]+|\xff\xff)+")
-# FF 00 X, or an FF whose second FF was lost, which is treated as a damaged byte.
+# Mark FF 00 X of a damaged byte X, or an FF whose second FF was lost: treated as a damaged byte.
 _MARKED: Final = re.compile(rb"\xff(?:\0.|(?=[^\0]))", re.DOTALL)
 
 
@@ -87,7 +87,7 @@ LINK_ERRORS = (OSError, termios.error)
 """Exceptions that a vanished serial port raises; `termios.error` is not an `OSError`."""
 
 _WRITE_S = 0.2
-# The fastest sensor sends as many bytes in 5 ms.
+# Bytes that one read of `drain` requests: as many as the fastest sensor sends in 5 ms.
 _DRAIN_BYTES = 416
 
 
@@ -143,11 +143,11 @@ class SerialPort:
         self._read_s = min(read_s, clock.poll_s)
         self._clock = clock
         self._port: serial.Serial | None = None
-        # None while the kernel does not mark damaged bytes.
+        # Decoder of the marks for damaged bytes; None while the kernel makes no marks.
         self._marks: Unmarker | None = None
 
     def open(self) -> None:
-        """Open the port and lock it. Raises `ConnectError`."""
+        """Open the port and lock it. Raises `ConnectError` if the port is missing, in use or not permitted."""
         # A pseudo-terminal rejects even parity when it is configured again, but can mark bytes. All settings are made
         # here, because pyserial switches the marks off whenever it configures the port.
         emulated = os.path.realpath(self._path).startswith("/dev/pts/")
@@ -166,7 +166,7 @@ class SerialPort:
             fix = "plug it in, end other programs that use it, and add this user to the group of the port"
             raise refusal(self._owner, self._path, exc, f"the port does not open ({exc})", fix) from exc
         with contextlib.suppress(ValueError, NotImplementedError, *LINK_ERRORS):
-            self._port.set_low_latency_mode(True)  # reduces the delay of some USB adapters from 16 ms to 1 ms
+            self._port.set_low_latency_mode(True)  # the latency of some USB adapters becomes 1 ms instead of 16 ms
 
     def close(self) -> None:
         """Close the port. Idempotent."""
@@ -181,13 +181,13 @@ class SerialPort:
         return self._port is not None
 
     def read(self, size: int) -> bytes:
-        """Read `size` bytes; fewer after the time-out `read_s`, or if marks were among them. Raises `StreamBroken`."""
+        """Read `size` bytes; fewer after `read_s` or with parity marks. Raises `StreamBroken` if the port is lost."""
         with self._in_use() as port:
             data = port.read(size)
         return self._undo(data)[0]
 
     def read_all(self, at_least: int) -> bytes:
-        """Read `at_least` bytes, fewer as in `read`, and all further bytes that have arrived. Raises `StreamBroken`."""
+        """Read `at_least` bytes (as `read`), then all that have arrived. Raises `StreamBroken` if the port is lost."""
         return self.read_marked(at_least)[0]
 
     def read_marked(self, at_least: int) -> tuple[bytes, list[int]]:
@@ -198,7 +198,7 @@ class SerialPort:
         return self._undo(data)
 
     def drain(self, silence_s: float, at_most_s: float) -> None:
-        """Drop received bytes until none arrives for `silence_s`, at most for `at_most_s`. Raises `StreamBroken`."""
+        """Drop bytes until none arrives for `silence_s`, at most for `at_most_s`. A lost port raises `StreamBroken`."""
         heard_ns = self._clock.now_ns()
         for _ in self._clock.looks(at_most_s):
             if self.read(_DRAIN_BYTES):
@@ -207,7 +207,7 @@ class SerialPort:
                 return
 
     def write(self, data: bytes, *, discard: bool = False) -> None:
-        """Send bytes; with `discard`, first drop all received bytes. Raises `StreamBroken`."""
+        """Send bytes; with `discard`, first drop all received bytes. Raises `StreamBroken` if the port is lost."""
         with self._in_use() as port:
             if discard:
                 port.reset_input_buffer()
@@ -231,7 +231,7 @@ class SerialPort:
 
 @dataclass(frozen=True, slots=True)
 class SerialProbe:
-    """How to recognize one kind of sensor on a serial port with one setting."""
+    """How a probe recognizes one kind of sensor on a serial port with one setting of the port."""
 
     url: str
     """Address of the sensor, with ``{port}`` for the port."""
@@ -241,7 +241,7 @@ class SerialProbe:
     request: bytes = b""
     """A read request; empty if the sensor is recognized by listening only."""
     identify: Callable[[bytes], str] | None = None
-    """Returns model and serial number from the reply to the request. Raises `ProtocolError`."""
+    """Returns model and serial number from the reply to the request. Raises `ProtocolError` for an invalid reply."""
     even_parity: bool = False
     boot_url: Callable[[bytes], str | None] | None = None
-    """Returns the address, with ``{port}``, if this sensor printed the received bytes while it booted, else None."""
+    """Returns the address, with ``{port}``, if the received bytes are the boot text of this sensor, else None."""

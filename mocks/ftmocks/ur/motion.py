@@ -485,7 +485,7 @@ class Arm:
                 self._paths.clear()
                 self.qd = self.qdd = ZERO6
                 raise
-        if state.q != self.q:  # while the arm rests, return the same object, by which readers recognise the rest
+        if state.q != self.q:  # at rest, keep the same tuple: other code detects rest by comparing identities
             self.q = state.q
         self.qd, self.qdd = (value if any(value) else ZERO6 for value in state[1:])
         self.still_s = 0.0 if any(self.qd) else self.still_s + dt

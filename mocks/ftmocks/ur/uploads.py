@@ -28,7 +28,7 @@ class Upload:
         return int(found.group(1)) if found else 0
 
     def compiled(self, robot: Robot) -> ControllerProgram:
-        """Return the program for a controller. Raises `UrscriptSyntaxError`."""
+        """Return the program for a controller. Raises `UrscriptSyntaxError` if the text is not a valid program."""
         if self.name == script.NAME:
             return script.ControlScript(robot, self.register_offset("int"), self.register_offset("float"))
         return Program(robot, self.name, self.text)

@@ -45,12 +45,12 @@ def text_of(value: Value) -> str:
 
 
 def is_number(value: Value) -> bool:
-    """Whether a value is a number, which a truth value is not."""
+    """Whether a value is a number; a bool does not count as one."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def number(value: Value, what: str) -> float:
-    """Return a value that must be a finite number."""
+    """Return a value unchanged; raise an error unless it is a finite number."""
     if not is_number(value) or not math.isfinite(value):
         raise ScriptError(f"{what} must be a number, not {text_of(value)}")
     found: float = value
@@ -58,21 +58,21 @@ def number(value: Value, what: str) -> float:
 
 
 def whole_number(value: Value, what: str, low: int, high: int) -> int:
-    """Return a value that must be an integer from `low` to `high`."""
+    """Return a value unchanged; raise an error unless it is an integer from `low` to `high`."""
     if type(value) is not int or not low <= value <= high:
         raise ScriptError(f"{what} must be a whole number from {low} to {high}, not {text_of(value)}")
     return int(value)
 
 
 def numbers(value: Value, what: str, count: int) -> list[float]:
-    """Return a value that must be a list of `count` numbers."""
+    """Return a value as numbers; raise an error unless it is a list of `count` numbers."""
     if type(value) is not list or len(value) != count:
         raise ScriptError(f"{what} must be a list of {count} numbers, not {text_of(value)}")
     return [number(item, what) for item in value]
 
 
 def joints(value: Value, what: str) -> Vector6:
-    """Return a value that must be six joint angles, rad."""
+    """Return a value as joint angles, rad; raise an error unless it is a list of six numbers."""
     return vector6(numbers(value, what, 6))
 
 
@@ -84,14 +84,14 @@ def element(whole: Value, index: Value) -> Value:
 
 
 def single(value: Value) -> Value:
-    """Return a value that may be an element of a list: a pose may, a list may not."""
+    """Return a value; raise an error unless it may be an element of a list: a pose may, a list may not."""
     if type(value) is list:
         raise ScriptError(f"a list of lists is not emulated: {text_of(value)}")
     return value
 
 
 def truth(value: Value) -> bool:
-    """Return a value that must be a truth value."""
+    """Return a value unchanged; raise an error unless it is a bool."""
     if not isinstance(value, bool):
         raise ScriptError(f"a condition must be True or False, not {text_of(value)}")
     return value
