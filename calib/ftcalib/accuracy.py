@@ -10,7 +10,7 @@ from ftcalib.model import Array
 from ftcalib.result import CalibrationResult
 from ftcalib.shown import values_of
 
-# Assumed distance of the tip from the flange if no tool is described.
+# Assumed distance of the tool tip from the flange if no tool is described.
 _USUAL_TIP_MM: Final = 200.0
 CONTACT_N: Final = 100.0
 """Contact force for which a sigma is reported, N."""
@@ -69,7 +69,7 @@ def tip_of(result: CalibrationResult) -> Array:
     described: Mapping[str, Any] = setup if isinstance(setup, dict) else {}
     rows = described.get("cylinders_mm") or [[0.0, _USUAL_TIP_MM, 0.0]]
     far = max(rows, key=lambda row: row[1])
-    # A row holds start, end, diameter, and optionally x and y of the axis.
+    # Each row of the cylinders holds start, end, diameter, and optionally x and y of the axis.
     x, y = far[3:] if len(far) > 3 else (0.0, 0.0)
     tip_mm = np.array([x, y, far[1] - (described.get("height_mm") or 0.0)])
     return np.asarray(result.R_flange_sensor.T @ tip_mm / 1e3)

@@ -141,7 +141,7 @@ def compare(  # noqa: PLR0913 - one argument for each known quantity
     return compared
 
 
-_ALL = "A+B+C+E+F+G"  # all except the test set D; H is a part of E
+_ALL = "A+B+C+E+F+G"  # Yu's sets except the test set D; E contains H
 # Cases of Yu's Table III: number, method, sets for the estimate, set for the test (`ftcalib.poses.selection`).
 CASES: tuple[tuple[int, Method, str, str], ...] = (
     *((1, "srom", "A", "D"), (2, "lrom", "A", "D"), (3, "lrom", "B", "D"), (4, "lrom", "B+C", "D")),

@@ -6,9 +6,9 @@ from html import escape
 from typing import Any, Final, NamedTuple
 
 MOST_LINES: Final = 10
-# Number of notes that the text always shows; a notebook shows all notes.
+# Number of notes that the text form of a summary always shows; a notebook shows all notes.
 _LEAST_NOTES = 2
-# Longest text of a field, in characters; longer text is cut.
+# Longest text of a field in a summary, in characters; longer text is cut.
 _LONGEST = 60
 # Colours that are readable on white and on black pages.
 _COLOURS: Final = {"good": "#2e8b57", "usable": "#b8860b", "rejected": "#d9534f"}
@@ -54,7 +54,7 @@ class Summary(NamedTuple):
         lines = []
         for name, (*first, last), unit in self.rows:
             filled = "".join(f"<td {pad}>{escape(cell)}</td>" for cell in first)
-            # the last cell spans the rest of the row
+            # the last cell of a row spans the remaining columns
             filled += f'<td colspan="{most - len(first) + (not unit)}" {pad}>{escape(last)}</td>'
             filled += f"<td {pad}>{escape(unit)}</td>" if unit else ""
             lines.append(f'<tr><th scope="row" {pad}>{escape(name)}</th>{filled}</tr>')

@@ -17,7 +17,7 @@ from typing import Any, Final, TypeAlias
 JSON: TypeAlias = Any
 # Largest file that is read as a whole: 200,000 poses with covariances.
 MOST_BYTES: Final = 200_000_000
-# Longest line of a file that is read line by line: a thousand times the size of a calibration.
+# Longest accepted line of a file that is read line by line: a thousand times the size of a calibration.
 _LONGEST_LINE: Final = 16_000_000
 
 
@@ -40,7 +40,7 @@ def write_new(path: str | Path, content: str | bytes) -> None:
     """
     path = Path(path)
     require_new(path)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # each process has its own name
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # each process writes a partial file of its own
     try:
         with partial.open("wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
@@ -87,7 +87,7 @@ def unused_path(path: Path) -> Path:
 
 
 def newest_path(path: Path) -> Path:
-    """Return the last existing path of the sequence name, name-2, name-3, …; the name itself if it does not exist."""
+    """Return the last existing path of the sequence name, name-2, name-3, …; `path` itself if none exists."""
     return [path, *takewhile(Path.exists, _numbered_paths(path))][-1]
 
 

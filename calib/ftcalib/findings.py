@@ -16,7 +16,7 @@ from typing import Any, Final, Literal, Self
 from ftcalib.display import Displayed, Summary
 from ftcalib.rounding import decimals, to_place_of
 
-# Effect of a finding on the result: rejected, at best usable, or none.
+# Effect of a finding on the verdict: "reject" rejects the result, "limit" makes it at best usable, "note" has none.
 Severity = Literal["reject", "limit", "note"]
 Verdict = Literal["good", "usable", "rejected"]
 
@@ -122,7 +122,7 @@ class Finding(Displayed):
         """Return the finding of a JSON object; raise `ValueError` if the object is damaged."""
         try:
             finding = cls(document["code"], document["severity"], document["values"])
-            _ = finding.words  # a value of a wrong type raises here
+            _ = finding.words  # raises if a value has a wrong type
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"finding {json.dumps(document)}: {error}") from error
         return finding
@@ -228,7 +228,7 @@ def _format_scale(unit_N: Sequence[float] | None) -> str:
     return f". According to the known mass, 1 unit = {unit} N (sigma {sigma} N)"
 
 
-# Formats of values that files of earlier versions lack.
+# Formats whose values may be missing, because earlier versions did not write them.
 _OPTIONAL: Final = frozenset(("scale",))
 _FORMS: Final[Mapping[str, Callable[[Any], str]]] = {
     "poses": _format_poses, "units": _format_units, "axes": _format_axes, "orders": _format_orders,

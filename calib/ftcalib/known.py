@@ -91,7 +91,7 @@ class Constraints:
             return minima
         if not self.yaw_only:
             return [self.R] if self.R_tolerance == 0 else [self.R, *minima]
-        angles = np.arange(24) * np.pi / 12  # sufficient, because the cost is a trigonometric polynomial of degree 2
+        angles = np.arange(24) * np.pi / 12  # enough starts, because the cost is a trigonometric polynomial of degree 2
         turned = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix() @ self.R
         r = np.swapaxes(turned, 1, 2).reshape(-1, 9)
         value = np.einsum("ki,ij,kj->k", r, cost, r)
@@ -99,7 +99,7 @@ class Constraints:
         return [*turned[low][np.argsort(value[low])][:4], *(minima if self.R_tolerance > 0 else [])]
 
     def satisfy(self, p: Parameters) -> Parameters:
-        """Return the parameters with the exactly known direction and norm of the gravity force."""
+        """Return the parameters with direction and norm of the gravity force replaced by those exactly known."""
         b = np.array(p.gravity_force_base_N)
         if self.direction is not None and self.direction_tolerance == 0:
             b = float(np.linalg.norm(b)) * self.direction
@@ -276,5 +276,5 @@ class Setup:
         return np.asarray(up / np.linalg.norm(up))
 
 
-# Description of a cell about which nothing is declared.
+# Description of a cell of which nothing is declared.
 NOTHING: Final = Setup()

@@ -149,7 +149,7 @@ def gravity_wrench(parameters: Parameters, R_base_flange: Array) -> Array:
         Wrench on the sensor, N and N·m, in the sensor frame, about the sensor origin.
     """
     R_base_sensor = R_base_flange @ parameters.R_flange_sensor
-    force_N = parameters.gravity_force_base_N @ R_base_sensor  # row vector times R is R.T times the vector
+    force_N = parameters.gravity_force_base_N @ R_base_sensor  # a row vector times R equals R.T times the vector
     torque_Nm = cross(parameters.p_sensor_com_m, force_N)
     return np.asarray(np.concatenate([force_N, torque_Nm], axis=-1))
 
@@ -227,7 +227,7 @@ def matrices_of(rotations: Rotations) -> NDArray[Any]:
 
 def skew(v: Array) -> Array:
     """Return the cross-product matrices (..., 3, 3) of vectors (..., 3): skew(a) @ b = a x b."""
-    if v.ndim == 1:  # the most frequent case, four times faster
+    if v.ndim == 1:  # a single vector, the usual case: four times faster
         x, y, z = v.tolist()
         return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     matrix = np.zeros((*v.shape[:-1], 3, 3))
@@ -252,7 +252,7 @@ def weight_and_tilt(F_b: Array) -> tuple[float, float, float]:
     base has (0, 0), a base on the ceiling (0, pi). If gravity is along base y, beta is undetermined and set to 0.
     """
     x, y, z = F_b.tolist()
-    beta = np.arctan2(0.0 - x, 0.0 - z) if x or z else 0.0  # not -x: a negative zero would turn pi to -pi
+    beta = np.arctan2(0.0 - x, 0.0 - z) if x or z else 0.0  # 0 - x instead of -x: a negative zero would turn pi to -pi
     return float(np.linalg.norm(F_b)), float(np.arctan2(y, np.hypot(x, z))), float(beta)
 
 

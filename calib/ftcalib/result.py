@@ -38,10 +38,10 @@ from ftcalib.shown import ShownEstimate, data_frame, shown_estimates, summary_ro
 # Number of sigmas of the sensor's gain above which the weighed and the estimated mass contradict each other.
 _CONTRADICTS = 4.0
 
-# Smallest eigenvalue of a correlation matrix that can be a rounding error.
+# Eigenvalues of a correlation matrix from here to 0 are rounding errors; a smaller one makes it invalid.
 INDEFINITE = -1e-6
 
-# Unit for the last part of a name; the rotation vector of the mounting is in rad.
+# SI unit of a quantity by the last part of its name; the mounting is a rotation vector in rad.
 _SI: Mapping[str, str] = {
     "kg": "kg", "m": "m", "N": "N", "Nm": "N·m", "rad": "rad", "sensor": "rad", "m2": "kg·m²", "s": "s",
 }  # fmt: skip
@@ -236,7 +236,7 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def is_edited(self) -> bool:
-        """Whether the file of the result was edited after solving and was accepted nevertheless."""
+        """Whether the result is from a file that was edited after solving, and that `accept_edited` allowed."""
         return bool(self.provenance.get("edited"))
 
     @property
@@ -608,7 +608,7 @@ def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]
     out = np.array([x, 0.0, z]) / h if h > 0 else np.array([1.0, 0.0, 0.0])  # away from the base y axis
     gradients = np.array([F_b / weight, (h * np.array([0.0, 1.0, 0.0]) - y * out) / weight**2])
     variance = np.einsum("ki,ij,kj->k", gradients, cov, gradients)
-    weight_sigma, alpha = np.sqrt(np.maximum(variance, 0.0)).tolist()  # a rounded variance may be negative
+    weight_sigma, alpha = np.sqrt(np.maximum(variance, 0.0)).tolist()  # rounding may make a zero variance negative
     along_beta = np.array([z, 0.0, -x])
     beta = float(np.sqrt(max(along_beta @ cov @ along_beta, 0.0))) / h**2 if h > 0 else float("inf")
     return weight_sigma, min(alpha, float(np.pi)), min(beta, float(np.pi))

@@ -13,7 +13,7 @@ from ftcalib.model import PARAMETER_NAMES, Array, DriftResult, Parameters, read_
 from ftcalib.sensor_matrix import Response, SensorMatrix
 
 _FORMAT = "ftdrive.calibration/2"
-# Earlier format, in which the bias of a session with drift is its mean.
+# Earlier format of the file, in which the bias of a session with drift is the mean bias.
 _EARLIER = "ftdrive.calibration/1"
 
 # Fields of a calibration file, in their order.
@@ -25,7 +25,7 @@ _NAMES = (
     *("cable_shift", "weights", "rejected_poses", "second_basin_chi2", "p_wrong", "quality", "g_m_s2"),
     *("parameter_names", "covariance", "hidden_covariance", "residuals", "provenance"),
 )
-# Fields that are read unchanged, and array fields. Files of version 0.1.0 and earlier lack the later arrays.
+# Fields of a file that are read unchanged, and array fields. Files of version 0.1.0 and earlier lack some arrays.
 _PLAIN = (
     *("chi2", "dof", "noise_source", "g_m_s2", "method", "provenance", "p_value", "components", "gain_sigma"),
     *("second_basin_chi2", "quality"),

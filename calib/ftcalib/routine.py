@@ -108,7 +108,7 @@ class PoseRecord:
     """Raw readings of arm and sensor at one pose."""
 
     stop: int
-    """Position in the tour, counted from 1; the return to the first pose is the last position."""
+    """Position of the pose in the tour, counted from 1; the return to the first pose is the last position."""
     pose: TourPose
     before: ArmReading
     after: ArmReading
@@ -118,9 +118,9 @@ class PoseRecord:
     attempts: int = 1
     """Number of dwells at this pose, including this one."""
     clock_offset_ns: int = 0
-    """Offset from the host clock to the clock of the run, ns; a run may span a restart of the computer."""
+    """Clock of the run minus clock of the host, ns: not zero if the computer was restarted during the run."""
     swings: bool = False
-    """Whether a weight hangs on a string. Its swing is then removed from the mean."""
+    """Whether a weight hangs on a string from the tool. Its swing is then removed from the mean."""
     mean: PoseMean = field(init=False)
     """Mean wrench and the covariance of the mean."""
 

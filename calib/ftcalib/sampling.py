@@ -13,4 +13,4 @@ class Sampling:
     attempts: int = 2
     """Largest number of dwells at a pose. A dwell with motion or drift is repeated; the last one is kept anyway."""
     noise_record_s: float = 12.0
-    """Duration of the noise record before a tour that determines the averaging time, s; 0: `average_s` is used."""
+    """Duration, s, of the noise record before a tour, from which the averaging time follows; 0: use `average_s`."""

@@ -50,10 +50,10 @@ FORMAT = "ftdrive.sensor/1"
 
 # Nonlinear errors, relative to the load: the certificates of six sensors state 0.08 to 0.28 % of range.
 FLOOR: Final = 0.0025
-# Degrees of freedom of the prior on the size of the errors.
+# Degrees of freedom of the prior on the common variance of a sensor's gain and cross-talk.
 _USUAL_COUNTS = 2.0
 
-# Limits of plausible values in a file: errors of the entries and their sigma relative to the ranges, lever, floor.
+# Limits for values in a sensor file: entries of E and their sigma relative to the ranges, lever (m), floor.
 _LARGEST_ERROR, _LARGEST_SIGMA, _LEVERS_M, _LARGEST_FLOOR = 0.5, 0.5, (1e-3, 10.0), 0.5
 
 _DIAGONAL = np.arange(0, 36, 7)
@@ -73,12 +73,12 @@ GAIN = np.array([np.diag([1.0, -1, 0]) / np.sqrt(2), np.diag([1.0, 1, -2]) / np.
 # (6, 3, 3) basis of the cross-talk, m; its coefficients are relative to a force at the lever `RANGE_LEVER_M`.
 CROSS_TALK_M = RANGE_LEVER_M * np.array([*(_symmetric(i, i) for i in range(3)), *_MIXED])
 SIZE = len(GAIN) + len(CROSS_TALK_M)
-# Prior standard deviation of each coefficient, for a mounted or aged sensor.
+# Prior standard deviation of each coefficient of gain and cross-talk, for a mounted or aged sensor.
 USUAL = USUAL_GAIN * np.array([1.0, 1.0, *[CROSS_TALK_SHARE] * 9])
-# Sum of the squared entries of each basis matrix, those of the cross-talk relative to the lever.
+# Sum of the squared entries of each basis matrix of `GAIN` and `CROSS_TALK_M`, the latter relative to the lever.
 SQUARES = np.array([1.0, 1, 2, 2, 2, 1, 1, 1, 2, 2, 2])
 
-# Weights with which the squared coefficients add up to the variance of one entry, if all nine are independent.
+# Weights with which the squared coefficients of the gain add up to the variance of one of nine independent entries.
 _WEIGHTS = np.array([1, 1, 2, 2, 2]) / 5
 # Smallest sigma of the gain common to all axes, which no orientation shows.
 LEAST_COMMON_GAIN = 0.002
@@ -214,7 +214,7 @@ class Calibrated:
         return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
-# Part of the gain that depends on the load, one standard deviation.
+# Standard deviation of the part of the gain that depends on the load.
 LOAD: Final = 0.005
 
 
@@ -412,7 +412,7 @@ class SensorMatrix(Displayed):
         if self.source == "loads" and rotation_covariance is None:
             T = block_diag(R.T, np.eye(36))
             return ContactResponse(self, parameters, E, T @ self.covariance @ T.T)
-        # For a sensor that is declared perfect nothing is updated.
+        # The zero covariance of a sensor that is declared perfect is not updated by a tool.
         if self.source != "loads" and shown is not None and C.any():
             H, coefficients, remaining = shown_by(p), shown.coefficients, shown.covariance[15:, 15:]
             # Posterior mean of the variance between axes (scaled inverse chi-square); the common part keeps its prior.
@@ -535,7 +535,7 @@ class ContactResponse:
 
     @property
     def scale_sigma(self) -> float:
-        """Relative standard deviation of the true weight of the tool."""
+        """Relative standard deviation of the true weight of the tool, due to the sensor's gain."""
         weight = self.parameters.gravity_force_base_N
         return float(np.sqrt(weight @ self.hidden_covariance[3:6, 3:6] @ weight) / max(weight @ weight, 1e-12))
 

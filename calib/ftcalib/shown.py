@@ -14,7 +14,7 @@ from ftcalib.errors import UsageError
 from ftcalib.model import Array
 from ftcalib.rounding import to_place_of, with_sigma
 
-# The first four fields of each `ShownEstimate`.
+# The first four fields of each `ShownEstimate`: label, conversion factor, unit, name in a calibration file.
 _QUANTITIES: Final[Sequence[tuple[str, float, str, str]]] = (
     ("mass", 1.0, "kg", "mass_kg"),
     ("centre of mass", 1e3, "mm", "p_sensor_com_m"),
@@ -43,7 +43,7 @@ class ShownEstimate(NamedTuple):
     unit: str
     """Displayed unit."""
     key: str
-    """Name of the quantity in a calibration file."""
+    """Name of the quantity in a calibration file, such as "mass_kg"."""
     values: Array
     """(k,) values in SI units."""
     sigma: Array
@@ -87,7 +87,7 @@ def summary_rows(estimates: Iterable[ShownEstimate]) -> list[Row]:
             f"{to_place_of(factor * value, 0.0)} fixed" if is_known else with_sigma(factor * value, factor * sigma)
             for value, sigma, is_known in zip(values, sigmas, known, strict=True)
         ]
-        if key == "tilt_beta_rad":  # in the same row as alpha
+        if key == "tilt_beta_rad":  # beta is shown in the row of alpha
             rows[-1] = Row("base tilt alpha, beta", [*rows[-1].cells, *cells], unit)
         elif key == "inertia_kg_m2":
             rows += [

@@ -28,7 +28,7 @@ from ftcalib.sensor_matrix import SensorMatrix
 
 # Number of simulations for the covariance of a published method.
 SIMULATIONS = 400
-# Smaller differences of the force, N, are below the resolution of any sensor.
+# Differences of the force below this value, N, are below the resolution of any sensor.
 UNRESOLVED_N = 1e-12
 # Largest plausible ratio of a force to the standard error of its mean.
 _RESOLVED = 3e6
@@ -310,7 +310,7 @@ def _fit_published(
     """Return the estimate of a published method; `best` provides degrees of freedom and second solution."""
     parameters = estimator(dataset.wrench)
     noise = wrench_cov
-    if noise is None:  # estimate the noise from the residuals of the method
+    if noise is None:  # noise from the residuals of the method
         residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
         square = (residuals**2).reshape(-1, 2, 3).mean(axis=(0, 2)) * 6 * len(dataset) / best.dof
         noise = np.broadcast_to(np.diag(np.repeat(np.maximum(square, 1e-24), 3)), (len(dataset), 6, 6))

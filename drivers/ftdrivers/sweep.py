@@ -88,7 +88,7 @@ class Sweep:
         return most
 
     def largest(self, derivative: int, step_s: float = 5e-3) -> Array:
-        """Return the largest absolute value (6,) of a derivative: of samples, with a bound on values between them."""
+        """Return the largest absolute value (6,) of a derivative: of samples, plus a bound for times between them."""
         t = np.arange(0.0, self.duration_s + step_s, step_s)
         return np.asarray(np.abs(self.at(t, derivative)).max(axis=0) + self.bound(derivative + 1) * step_s / 2)
 

@@ -141,7 +141,7 @@ class Writer:
         self.is_saved = True
 
     def discard(self) -> None:
-        """Delete the file."""
+        """Delete the unfinished file."""
         with self._lock:
             file, self._file = self._file, None
         if file is not None:
@@ -411,7 +411,7 @@ class Player:
         self._passages = transcript.passages
         self._far = _Terminal(transcript)
         self._next = 0
-        self._t_ns = transcript.opened_ns  # recorded time of the current position
+        self._t_ns = transcript.opened_ns  # time in the recording up to which it was played
         self._t = 0.0
         self._asked = bytearray()
         self._ended = threading.Event()
@@ -421,7 +421,7 @@ class Player:
 
     @property
     def left_s(self) -> float:
-        """Duration of the rest of the recording, s."""
+        """Duration of the part of the recording that was not played yet, s."""
         left = self._passages[self._next :]
         return (left[-1].t_ns - left[0].t_ns) / 1e9 if left else 0.0
 
@@ -472,7 +472,7 @@ class Player:
         return self._t + (passage.t_ns - self._t_ns) / 1e9 - self._clock.now_s()
 
     def _listen(self) -> None:
-        """Compare what the driver writes with the next request of the recording."""
+        """Compare what the driver has written with the next recorded request; go on, or set `divergence`."""
         while self._asked and not self.divergence:
             first = self._request_from(self._next)
             if first is None:  # the driver is closing the port, or the recording was interrupted
@@ -515,7 +515,7 @@ class _Terminal:
         self._master, slave = os.openpty()
         path = os.ttyname(slave)
         tty.setraw(slave)
-        os.close(slave)  # the master then shows whether a driver has the port open
+        os.close(slave)  # only then the master shows whether a driver has the port open
         os.set_blocking(self._master, False)
         return path
 
@@ -542,7 +542,7 @@ class _Terminal:
         try:
             data = os.read(self._master, 4096)
         except OSError:
-            return None  # the driver has closed the port
+            return None  # error: the driver has closed the port
         return self._frames_of(data) if self._frames else data
 
     def _frames_of(self, data: bytes) -> bytes:

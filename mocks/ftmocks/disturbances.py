@@ -39,7 +39,7 @@ class Push:
     until_s: float = FOREVER_S
 
     def wrench(self, now_s: float, _q: Vector6, R_base_sensor: Array) -> Array | None:
-        """See `Contact`."""
+        """Return the wrench of this contact on the sensor, see `Contact.wrench`."""
         if now_s >= self.until_s:
             return None
         if self.in_sensor:
@@ -68,7 +68,7 @@ class Ramp:
     seconds: float
 
     def wrench(self, now_s: float, _q: Vector6, R_base_sensor: Array) -> Array | None:
-        """See `Contact`."""
+        """Return the wrench of this contact on the sensor, see `Contact.wrench`."""
         share = min(1.0, max(0.0, (now_s - self.start_s) / self.seconds))
         force_N = R_base_sensor.T @ (self.before_N + share * (self.after_N - self.before_N))
         return np.concatenate((force_N, cross(self.p_sensor_m, force_N)))
@@ -100,7 +100,7 @@ class Cable:
     within_rad: float = 0.0
 
     def wrench(self, _now_s: float, q: Vector6, R_base_sensor: Array) -> Array | None:
-        """See `Contact`."""
+        """Return the wrench of this contact on the sensor, see `Contact.wrench`."""
         force_N = R_base_sensor.T @ self.force_base_N * self._tension(q, R_base_sensor)
         return np.concatenate((force_N, cross(self.p_sensor_m, force_N)))
 

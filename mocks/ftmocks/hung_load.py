@@ -97,7 +97,7 @@ class HungLoad:
         return (along - math.sqrt(along * along - square * (float(free @ free) - square))) / square
 
     def wrench(self, _now_s: float, _q: Vector6, R_base_sensor: Array) -> Array | None:
-        """See `Contact`."""
+        """Return the wrench of this contact on the sensor, see `Contact.wrench`."""
         force_N = R_base_sensor.T @ self.force_base_N
         return np.concatenate((force_N, cross(self._p_sensor_hook_m, force_N)))
 

@@ -21,7 +21,7 @@ from ftcalib.shown import data_frame
 
 FORMAT = "ftdrive.dataset/1"
 
-# Rotations that map flange to base coordinates, like a robot pose, or the inverse, like e_bR in the papers.
+# What orientations map: flange to base coordinates, like a robot pose, or the inverse, like e_bR in the papers.
 Orientation = Literal["R_base_flange", "R_flange_base"]
 
 # Largest accepted value in N, N·m or their squares, so that powers of it do not overflow.
@@ -310,7 +310,7 @@ def _covariance_problem(C: Array) -> str | None:
 _TRUSTED_SAMPLES = 100.0
 # Ratio of median to mean of the variance of six Gaussian values: the median of chi-square(5), divided by 5.
 _MEDIAN_SCATTER = 0.8702920382191053
-# A pose whose variances scatter more than this, relative to their degrees of freedom, keeps its shape; 1 % by chance.
+# A pose whose six variances scatter by more than this factor keeps its own covariance shape; 1 % do so by chance.
 _UNLIKE = 3.0
 
 
@@ -362,7 +362,7 @@ def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
     own[known] = np.maximum(freedom / (freedom + _TRUSTED_SAMPLES), unlike)
     common[known] = (1 - own[known]) * size
     pooled = own[:, None, None] * wrench_cov
-    for i, j in np.ndindex(6, 6):  # avoids a second array of the same size
+    for i, j in np.ndindex(6, 6):  # in place, which avoids a second array of this size
         pooled[:, i, j] += common * shape[i, j]
     return pooled
 

@@ -31,7 +31,7 @@ SWING_SHARE = 0.25
 # Number of block means of a dwell that are searched for the frequency of a swing.
 SWING_BLOCKS = 200
 
-# Largest rounding error, relative to the largest value.
+# Differences below this share of the largest value are rounding errors.
 ROUNDING = 1e-9
 
 
@@ -172,7 +172,7 @@ def is_quiet(wrench: Array, level: Array) -> bool:
 def restless_channels(wrench: Array, level: Array) -> NDArray[np.bool_]:
     """Return which channels (6,) of a dwell have more than twice the noise of the untouched sensor."""
     wrench = _require_samples(wrench)
-    flicker = _resolution(wrench) / 2  # between two adjacent values, normal for coarse quantisation
+    flicker = _resolution(wrench) / 2  # noise below one quantisation step, which is normal for coarse quantisation
     return np.asarray(wrench.std(axis=0, ddof=1) > RESTLESS * level + flicker + ROUNDING * np.abs(wrench).max(axis=0))
 
 
@@ -228,7 +228,7 @@ SHORTEST_S, LONGEST_S = 1.0, 10.0
 # Step of the averaging times, which contains whole periods of 50 Hz and of 60 Hz mains.
 STEP_S = 0.1
 
-# Length of block means, short enough for averages of a second or more.
+# Duration of the blocks of which a record is reduced to means; short compared with averaging times of 1 s or more.
 BLOCK_S = 0.02
 
 # Smallest length of a record, in averaging times, for estimating the scatter of averages.
@@ -237,7 +237,7 @@ AVERAGES_IN_RECORD = 3
 # A shorter average is accepted if its sigma is larger by at most this factor, because the minimum is flat and noisy.
 FLAT = 1.05
 
-# If the sigma of the longest average exceeds the prediction for white noise by this factor, the cause is drift.
+# A sigma of the longest average that exceeds the prediction for white noise by this factor is due to drift.
 DRIFTS = 2.0
 
 
@@ -250,9 +250,9 @@ class AveragingTime:
     sigma: Array
     """(6,) standard deviation of a mean over the averaging time, N and N·m."""
     floor: Array
-    """(6,) smallest sigma over all examined averaging times, per channel, N and N·m."""
+    """(6,) smallest standard deviation of each channel over all examined averaging times, N and N·m."""
     reached: bool
-    """Whether every channel meets its target."""
+    """Whether the standard deviation of every channel meets its target."""
     words: str
     """Sentence with averaging time and sigma, and the reason if a target is not reached."""
 

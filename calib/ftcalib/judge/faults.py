@@ -26,39 +26,39 @@ READINGS = {
 }
 # Orders of rotations by three angles about base axes; rotations about tool axes have the reverse order.
 EULER_ORDERS = tuple("".join(axes) for axes in permutations("xyz"))
-# Largest difference of scores of equally good interpretations of the orientations.
+# Interpretations of the orientations whose scores differ by less than this are equally good.
 EQUAL = 0.1
-# A mistake is accepted if its correction reduces the residual to this share.
+# A mistake counts as found if its correction reduces the residual (of force or torque) to this share or less.
 COLLAPSE = 0.4
-# Largest accepted increase of the other residual, as a factor.
+# The correction of a mistake in force or torque must not increase the residual of the other by more than this factor.
 NO_WORSE = 1.2
 # Largest force residual after a correction, as a share of the weight.
 CORRECTED = 0.1
 # Penalty, in the logarithm of the residuals, of a weight that pulls sideways, and of a tool inside the flange.
 IMPLAUSIBLE = 1.0
-# Residuals that differ by a smaller factor are considered equal, and the simpler explanation is preferred.
+# If the residuals of two explanations differ by a smaller factor, the simpler explanation is preferred.
 TIED = 1.3
 # Force residuals, as shares of the weight, above which the poses are suspected, and above which they are taken for
 # other poses rather than inaccurate ones. Largest radial share of the residual if the wrenches are those of a weight.
 OFF_POSES, OTHER_POSES, OF_A_WEIGHT = 0.015, 0.15, 0.1
 # A force that is constant in base axes counts as a weight within this angle of straight down.
 IN_BASE_RAD = np.deg2rad(10.0)
-# Largest relative variation of a constant force.
+# Largest relative variation of a force that counts as constant over the poses.
 STEADY = 0.05
 # Smallest number of poses with the same extreme reading of a saturated channel.
 FEWEST_SATURATED = 3
-# Smallest number of degrees of freedom of a regression that predicts readings.
+# Smallest number of degrees of freedom of the regression that predicts the readings of a channel.
 FEWEST_TO_PREDICT = 4
-# With fewer poses, equal readings are unexpected if their predictions differ by more than this share of the spread.
+# Without a regression, equal readings are unexpected if their orientations predict a spread above this share of all.
 UNEQUAL = 0.05
-# Probability, per reading, of a larger deviation from the prediction by chance.
+# False-alarm probability, per reading, of a deviation from its prediction.
 BY_CHANCE = 1e-6
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
 # Number of poses that are searched for steps of the readings.
 FOR_STEPS = 1000
 # Smallest number of different readings that shows steps: a weight along the axes alone reads -weight, 0 and +weight.
 FEWEST_STEPS = 4
-# Largest number of decimal places of a table.
+# Largest number of decimal places that is searched for in written readings.
 DECIMALS = 9
 # Rounding matters if its standard deviation exceeds this share of the spread of the readings.
 COARSE = 0.005
@@ -316,7 +316,7 @@ def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
 
 
 def _tied(readings: Array) -> list[NDArray[np.intp]]:
-    """Return the rows with the smallest reading and those with the largest, if there are enough to show saturation."""
+    """Return the rows that share the smallest reading, and those that share the largest, if enough for saturation."""
     limits = [np.flatnonzero(readings == limit) for limit in (readings.min(), readings.max())]
     return [rows for rows in limits if len(rows) >= FEWEST_SATURATED]
 
@@ -337,7 +337,7 @@ def _unexpected(R_base_flange: Array, wrench: Array, rows: NDArray[np.intp], cha
     X = design[others]
     slope = np.linalg.lstsq(X, wrench[others])[0]
     squares = np.sum((wrench[others] - X @ slope) ** 2, axis=0).reshape(2, 3).sum(axis=1)
-    noise = np.repeat(np.sqrt(squares / (3 * dof)), 3)  # of force and of torque
+    noise = np.repeat(np.sqrt(squares / (3 * dof)), 3)  # of force, then of torque
     leverage = np.einsum("ni,ij,nj->n", design[rows], np.linalg.pinv(X.T @ X), design[rows])
     limit = -stdtrit(3 * dof, BY_CHANCE) * noise * np.sqrt(1 + leverage)[:, None] + _channel_steps(wrench)
     return bool((np.abs(design[rows] @ slope - wrench[rows]) > limit)[:, channels].any())
@@ -351,7 +351,7 @@ def _channel_steps(wrench: Array) -> Array:
 
 
 def written_step(wrench: Array) -> Array:
-    """Return the last decimal place (6,) of forces and torques that were written rounded.
+    """Return the value (6,) of the last decimal place of forces and torques that were written rounded, such as 0.01.
 
     It is 0 if they were not rounded, or if the rounding is so coarse that `broken_channels` reports it.
     """
@@ -364,7 +364,7 @@ def written_step(wrench: Array) -> Array:
 
 
 def _last_place(part: Array) -> float:
-    """Return the last decimal place of forces or torques (n, 3); 0 if they have more than `DECIMALS` decimals."""
+    """Return the value of the last decimal place of forces or torques (n, 3); 0 for more than `DECIMALS` places."""
     places = (10.0**-k for k in range(DECIMALS) if np.abs(part - np.round(part, k)).max() < 1e-3 * 10.0**-k)
     return next(places, 0.0)
 
@@ -381,6 +381,6 @@ def _coarse_step(readings: Array) -> float:
 
 
 def _copies(wrench: Array) -> list[NDArray[np.intp]]:
-    """Return, for each wrench that occurs more than once, the rows with this wrench."""
+    """Return a group of rows for each wrench that occurs in more than one row."""
     _, first, count = np.unique(wrench, axis=0, return_index=True, return_counts=True)
     return [np.flatnonzero((wrench == wrench[row]).all(axis=1)) for row in np.sort(first[count > 1])]

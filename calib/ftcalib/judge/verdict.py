@@ -135,11 +135,11 @@ class Quality:
     accidents: bool
     """Whether the rejected poses are isolated outliers; rounding alone may also reject poses."""
     suspect: bool
-    """Whether a mistake in the data may be the cause of errors, rejected poses or cross-talk."""
+    """Whether there are large errors, rejected poses or cross-talk that a mistake in the data may have caused."""
     residual_sigma: Array
     """(n,) leave-one-out residual of each pose in sigma, rms over the channels: 1 expected."""
     worst_pose: int
-    """Row of the used pose with the largest leave-one-out residual."""
+    """Row, counted from 0, of the used pose with the largest leave-one-out residual."""
     lag1: float
     """Correlation of the residuals of successive used poses; near 0 without drift."""
     lag1_p: float
@@ -373,14 +373,14 @@ def _cell_findings(
         hidden = hidden_in_any_poses(parameters, setup.orientation_rad)
         named += described_cell.directions(parameters, covariance + hidden, setup, case.written)
         named += [each for each in payload if each.code == "payload_units" and not broken]
-    if verdict_of([*findings, *named]) != "rejected":  # contradictions of a rejected result are consequences
+    if verdict_of([*findings, *named]) != "rejected":  # else these follow from a cause
         named += [each for each in payload if each not in named]
         named += described_cell.tool(parameters, covariance, setup, case.g_m_s2)
     return named
 
 
 def _few_rejected(used: NDArray[np.bool_]) -> bool:
-    """Whether so few poses were rejected that they are isolated outliers."""
+    """Whether so few of the poses were rejected that the rejected ones are isolated outliers."""
     return bool(used.sum() >= (1 - FEW_LEFT_OUT) * len(used))
 
 
@@ -425,7 +425,7 @@ def _successive_correlation(standardized: Array, t_s: Array | None = None) -> tu
 
 
 def strong_correlations(covariance: Array, least: float = CORRELATED) -> tuple[tuple[str, str, float], ...]:
-    """Return the pairs of parameters with a correlation above `least`, strongest first."""
+    """Return the pairs of parameters whose absolute correlation exceeds `least`, the strongest first."""
     sigma = np.sqrt(np.diag(covariance))
     sigma[sigma == 0] = 1.0  # exactly known
     correlation = covariance / np.outer(sigma, sigma)
@@ -452,7 +452,7 @@ def _error_findings(
             ("cross-validation", left_out[k]),
             ("uncertainty over all orientations", expected[k]),
         )
-        # The error that exceeds most limits is reported; of equal ones the first.
+        # Of the three errors, the one that exceeds most limits is reported; if several do, the first of them.
         limits = [sum(error > limit * scale for limit in (USABLE_SHARE, REJECTED_SHARE)) for _, error in errors]
         source, error = errors[int(np.argmax(limits))] if max(limits) else max(errors, key=lambda pair: pair[1])
         share = error / scale if scale else float("inf")
@@ -484,7 +484,7 @@ def _second_solution(found: Estimate, free: Estimate | None = None) -> list[Find
     delta = found.second_basin_chi2 / max(1.0, fitted.chi2 / fitted.dof)
     if delta >= ACCEPTED_DELTA_CHI2:
         return []
-    # Calibrated on 8954 simulated calibrations.
+    # This probability agrees with its frequency in 8954 simulated calibrations.
     probability = float(1 / (1 + np.exp(max(delta, 0.0) / 2)))
     return [Finding.of("second_solution", probability_percent=100 * probability)]
 
@@ -534,7 +534,7 @@ def _left_out_rms(found: Estimate, poses: NDArray[np.bool_]) -> tuple[float, flo
 
 
 def _is_unchecked(found: Estimate) -> NDArray[np.bool_]:
-    """Return whether each pose (n,) cannot be predicted from the others."""
+    """Return which poses (n,) cannot be checked, because the others do not determine their prediction."""
     return np.asarray(np.trace(found.left_out_cov[:, :3, :3], axis1=1, axis2=2) > found.parameters.weight_N**2)
 
 
@@ -569,7 +569,7 @@ def _component_sizes(found: Estimate, *names: str) -> Array:
 
 
 def _per_N(found: Estimate) -> Array:
-    """Return the reference force and torque (2,) for relative errors."""
+    """Return the force and torque (2,) to which errors are related: weight, and weight times lever."""
     return np.array([1.0, _lever_m(found)]) * found.parameters.weight_N
 
 

@@ -217,7 +217,7 @@ def _best_mistake(
 
     Each fit starts from the initial model, because a fit without the mistake may be far from the solution.
     """
-    # The sizes are estimated with the mistake, because without it they grow and hide it.
+    # Disturbances are limited to their usual sizes here: a mistake makes them larger, which would hide the mistake.
     usual, linear = np.minimum(logarithms, 0.0), model.linear()
     plain = model.evaluate(usual, linear)
     gains: dict[Mistake, float] = {}

@@ -35,25 +35,25 @@ from ftcalib.motion.samples import MotionRows
 _CONTACT = float(chi2_isf(6, 1e-7))
 # Smallest force or torque residual of a row in contact, in a motion with a contact guard.
 TOUCH_N, TOUCH_NM = 2.0, 0.2
-# Quantile of the residuals of a state of motion that is assumed to be free of contact.
+# Share of the rows of each state of motion, those with the smallest residuals, that are assumed to have no contact.
 QUIET = 0.4
 # Largest share of rows in contact; beyond it the model does not fit at all.
 _MOST_CONTACT = 0.8
 # Rows left out on both sides of a contact, because the filter spreads the contact.
 _MARGIN = 2
-# A component is kept if it lowers -2 log restricted likelihood by at least this.
+# A component of the noise model is kept if it lowers -2 log restricted likelihood by at least this much.
 _WORTH = 4.0
 
-# Initial standard deviations of components.
+# Initial standard deviations of gain and cross-talk.
 _ROUGH: Mapping[str, float] = {"gain": 0.02, "cross_talk": 0.02}
 _SAME_RAD = 0.2
-# Window of the moving average of the variance, and weight of the mean variance of the state as a prior, both in rows.
+# Local noise: window of its moving average, and weight of the mean noise of the state as a prior, both in rows.
 _AROUND, _PRIOR_ROWS = 3, 1.0
 # Largest number of steps of the fit with a prior, and the change of its cost at which the fit has converged.
 _PRIOR_STEPS, _SETTLED = 20, 1e-4
-# Number of stages, and the stages that first choose the components.
+# Number of stages of the fit, and the stages that begin by choosing the sizes of the components.
 _STAGES, _CHOICES = 6, (1, 2, 4)
-# First stage whose model has the components of `EXPECTED`. Earlier, they would absorb contact.
+# First stage of the fit whose model has the components of `EXPECTED`. Earlier, they would absorb contacts.
 _ALWAYS = 1
 # Candidate standard deviations of each component; of a walk, the change of the bias per square root of a second.
 _SIZES: Mapping[str, Array] = {
@@ -72,7 +72,7 @@ _SIZES: Mapping[str, Array] = {
 }
 # Prior of a standard deviation: probability that it is 0, and one sigma of its logarithm otherwise, as a factor.
 _ABSENT, _WITHIN = 0.7, 3.0
-# Squared distance of a row with weight 1/4 in a converged robust fit.
+# Final limit of the robust fit: a row at this squared distance has the weight 1/4.
 LIMIT = 22.0
 
 
@@ -94,11 +94,11 @@ class MotionFit:
     distance: Array
     """(n,) squared Mahalanobis distance of each residual: chi-square with 6 degrees of freedom without contact."""
     drift: DriftResult | None
-    """Drift over the rows; its course is relative to the bias of `load`, the last one. None without a walk."""
+    """Drift of the bias; `course` is relative to the last bias, which is that of `load`. None without a random walk."""
     mean_bias: Array | None = None
     """(6,) mean of the bias over the rows, N and N·m; None without drift."""
     components: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviations of the components, by name and unit."""
+    """Standard deviations of the components of the noise model, by name and unit."""
     second_basin_chi2: float | None = None
     """Increase of chi2 at the second best mounting; None if there is no other."""
     chi2: float = 0.0
@@ -108,7 +108,7 @@ class MotionFit:
 
     @property
     def prior_share(self) -> Array:
-        """(8,) posterior over prior standard deviation of inertia, height and delay."""
+        """(8,) ratio of posterior to prior standard deviation, for inertia (6), height and delay."""
         expected = np.r_[np.full(6, max(self.load.mass_kg, 0.1) * GYRATION_M**2), HEIGHT_M, DELAY_S]
         return np.asarray(np.sqrt(np.diag(self.covariance)[15:23]) / expected)
 
@@ -152,7 +152,7 @@ def fit_motion(
         state = motion_states(rows.speed_rad_s, kept)
         r = problem.residuals(load, effects)
         absorbed = problem.absorb(load, rows[kept], solved)
-        # At first an autoregression would absorb the slow noise whose standard deviation is chosen later.
+        # In the first stages no autoregression: it would absorb the slow noise, whose size is chosen later.
         order = ORDER if stage > _ALWAYS else 0
         noise = RowNoise.of(r[kept], absorbed, state[kept], places_in_runs(rows.t_s[kept], rows.row_s), order=order)
         if guarded:
@@ -182,7 +182,7 @@ def fit_motion(
     for other, _ in roughs[1:] if prior is None else ():
         if angle_between(other.static.R_flange_sensor, load.static.R_flange_sensor) > _SAME_RAD:
             there = problem.sums(other, effects, noise, kept, state)
-            # Chi2 after one linear step at the other mounting, minus the chi2 of this one.
+            # Chi2 of the other mounting after one linear step, minus chi2 of the fitted mounting.
             others.append(there[2] - float(there[1] @ problem.solve(sizes, there, other, effects).step) - chi2)
     walk, course = None, problem.hats(rows.t_s) @ problem.drift(effects)
     if sizes.get("walk_N") or sizes.get("walk_Nm"):
@@ -375,7 +375,7 @@ def _without_contact(distance: Array) -> NDArray[np.bool_]:
     near = distance > _CONTACT
     for _ in range(_MARGIN):
         near = near | np.append(near[1:], False) | np.append(False, near[:-1])
-    return ~near if near.mean() < _MOST_CONTACT else np.ones(len(near), bool)  # the model fits no row: keep all
+    return ~near if near.mean() < _MOST_CONTACT else np.ones(len(near), bool)  # then the model is wrong: keep all
 
 
 def _choose_sizes(
@@ -402,7 +402,7 @@ def _choose_sizes(
             continue
         worth, slow = -_WORTH, name.replace("walk", "slow")
         of_sizes = values(name, **{slow: 0.0})
-        if name != slow:  # slow noise looks like a random walk
+        if name != slow:  # a walk must explain more than slow noise does
             worth = min(worth, float(values(slow, **{name: 0.0}).min()))
         best = int(np.argmin(of_sizes))
         chosen[name] = float(tried[best]) if of_sizes[best] < worth else 0.0

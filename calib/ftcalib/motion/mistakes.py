@@ -23,7 +23,7 @@ from ftcalib.motion.estimate import FreeFit, MotionFit, robust_weights
 from ftcalib.motion.model import HEIGHT, INERTIA, SECOND_MOMENTS, SIZE, PoseError
 from ftcalib.motion.samples import MotionRows
 
-# Positions that spread farther may be in another unit, if the scale of the acceleration agrees with that unit.
+# Positions that spread over more than this are in another unit if the scale of the acceleration agrees with it.
 _FARTHEST_M: Final = 3.0
 _LENGTHS_M: Final[Mapping[str, float]] = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
 # Largest relative difference between the scale of the acceleration and a unit.
@@ -40,7 +40,7 @@ _CLOCK_SHARE: Final = 0.03
 _ASIDE_M: Final = 0.01
 # The signs of channels are certain if scale and moment are this many sigmas above 0.
 _SIGNED: Final = 3.0
-# A clock scale off by this share, but only by this many sigmas, is not corrected. If found alone, it limits a result.
+# A clock rate wrong by this share, but with only so many sigmas, is not corrected. Found alone, it limits a result.
 _DOUBTFUL_SIGMAS, _DOUBTFUL_SHARE = 4.5, 0.15
 # Largest plausible distance between the axes of sensor and flange.
 _FAR_ASIDE_M: Final = 0.03
@@ -53,23 +53,23 @@ _TCP_M: Final = 0.1
 _GYRATION_M: Final = 0.01
 # Number of 10 ms means averaged on each side of a step, and number within the step.
 _BESIDE, _WITHIN = 5, 1
-# A zeroing reduces the readings to this share, by this multiple of the usual change among this many means around it,
-# and by at least this force.
+# A step is a zeroing if it reduces the readings to this share, is this many times the usual change among so many means
+# around it, and is at least this force (N).
 _ZERO_SHARE, _STEPS, _AROUND, _LEAST_STEP_N = 0.25, 4.0, 101, 1.0
 # Share of a step of the reading that must be a step of the bias. A contact that ends leaves no step of the bias.
 _STAYS: Final = 0.6
-# Indices of lateral offset and height in the covariance of a free fit.
+# Indices of the sensor's position (lateral offset, height) in the covariance of a `FreeFit`.
 _POINT: Final = np.r_[SIZE + 1, SIZE + 2, HEIGHT]
 
-# Number of rows that are judged like static poses.
+# Number of rows of a motion that are judged like static poses.
 JUDGED_ROWS: Final = 300
-# Codes of wrong axes and orientations, which explain all other findings.
+# Codes of findings about wrong axes and orientations; each explains all other findings.
 OF_AXES: Final = frozenset(
     ("orientations_inverted", "quaternion_order", "wrench_in_base", "constant_force", "axes_disagree")
 )
 
 Correction = Callable[[MotionRows], MotionRows]
-"""Function that returns rows without the mistakes."""
+"""Function that removes the found mistakes from rows of a motion."""
 
 
 def unchanged(rows: MotionRows) -> MotionRows:
@@ -98,11 +98,11 @@ def find_zeroings(wrench: Stream) -> tuple[Array, Array]:
     after, steps = means[apart:], means[apart:] - means[:-apart]
     left, sizes = (np.linalg.norm(each.reshape(-1, 2, 3), axis=2) for each in (after, steps))
     usual = median_filter(sizes, (_AROUND, 1))
-    # After a step, the reading changes no faster than usual.
+    # The reading after a zeroing is small: at most a share of the step, or the usual change between two averages.
     to_zero = (left < np.maximum(_ZERO_SHARE * sizes, usual)).all(axis=1)
     steep = np.flatnonzero(to_zero & (sizes[:, 0] > np.maximum(_STEPS * usual[:, 0], _LEAST_STEP_N)))
     groups = np.split(steep, np.flatnonzero(np.diff(steep) > 2 * apart) + 1) if len(steep) else []
-    # In the middle of a group the means lie on both sides of the step.
+    # Several successive times show one step; the middle one has the averages on both sides of it.
     best = np.array([group[len(group) // 2] for group in groups], np.intp)
     return t_s[best + _BESIDE + _WITHIN], steps[best]
 
@@ -151,7 +151,7 @@ def find_motion_mistakes(rows: MotionRows, free: FreeFit, spread_m: float) -> tu
     change = np.sqrt(np.mean(rows.wrench.reshape(-1, 2, 3).var(axis=0), axis=1))
     if (free.residual > _SUSPECT * change).any() and (named := _axis_findings(rows, change)):
         return named, unchanged
-    # Without a weight in the wrench the scale is arbitrary.
+    # If the wrench contains no weight, the fitted scale of the acceleration is arbitrary.
     if (free.residual > _EXPLAINED * change).any() or abs(free.error.scale) > 1 / COMPENSATED:
         return [], unchanged
     load, Q, sigma = free.load, free.load.static.R_flange_sensor, np.sqrt(np.diag(free.covariance))
@@ -237,7 +237,7 @@ def _other_point(to_com: Array, com: Array, sigma: Array, *, behind: bool, uprig
     aside_m, height_m = float(np.linalg.norm(point[:2])), float(point[2])
     beside = aside_m > max(_ASIDE_M, _SIGMAS * float(sigma[:2].max()))
     elsewhere = not _is_height(height_m, float(sigma[2]))
-    # A centre of mass this far away means wrong units, which the verdict reports.
+    # A very distant centre of mass means wrong units, which the verdict reports.
     if not (beside or elsewhere or behind) or np.linalg.norm(com) > FAR_COM_M:
         return []
     along = height_m > _LOWEST_M - SIGNIFICANT_SIGMAS * sigma[2] and (not beside or height_m > aside_m)

@@ -100,7 +100,7 @@ class PoseError:
     aside_m: Array = field(default_factory=lambda: np.zeros(2))
     """(2,) offset from the recorded point to the axis through the sensor origin, in the axes of the poses, m."""
     turning: float = 1.0
-    """Scale of `Omega`: equal to `scale` if the times are wrong, 1 if only the positions are wrong."""
+    """Scale of `Motion.Omega_rad2_s2`: equal to `scale` if the times are wrong, 1 if only the positions are wrong."""
 
     def undone(self, motion: Motion) -> Motion:
         """Return a motion, or the rate of change of a motion, with the error removed."""
@@ -160,7 +160,7 @@ def lever_columns(load: MovingLoad, motion: Motion) -> Array:
     return np.concatenate([dU, skew(static.p_sensor_com_m) @ dU], axis=1)
 
 
-# Share of the variance below which a component is dropped, and largest number of orientations in the kernel matrix.
+# A principal component with a smaller share of the variance is dropped; largest number of orientations of the kernel.
 _NEGLIGIBLE, _RESTING_ON = 1e-3, 200
 
 

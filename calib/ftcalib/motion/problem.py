@@ -61,13 +61,13 @@ from ftcalib.motion.samples import Motion, MotionRows
 
 # Prior sigmas of a tool: radius of gyration, height of the sensor, and delay that the rows are not yet corrected for.
 GYRATION_M, HEIGHT_M, DELAY_S = 0.15, 0.3, 0.3
-# Interval and largest number of the knots of the bias.
+# Knots between which the drifting bias is interpolated: interval, s, and largest number.
 KNOT_S, _MOST_KNOTS = 5.0, 25
-# Lever at which orientation errors of the arm shift the flange.
+# Lever that converts an orientation error of the arm to a shift of the flange, m.
 _REACH_M = 0.3
-# Slow noise: time constant, interval of the knots and their largest number.
+# Slow noise: time constant, s, interval of the knots of its interpolation, s, and their largest number.
 SLOW_S, _SLOW_KNOT_S, _MOST_SLOW = 5.0, 2.5, 48
-# Prior of the rest of a zeroing step after its removal from the rows, one sigma.
+# Prior sigma of what remains of the bias step of a zeroing after its removal from the rows.
 _ZEROED_N, _ZEROED_NM = 10.0, 1.0
 # Ridge term of the scaled equations: undetermined directions have a standard deviation of 1e6 times their scale.
 RIDGE = 1e-12
@@ -90,7 +90,7 @@ ROUGH_ROWS = 600
 _RESPONDING = np.r_[0:15, GAINS.start : SIZE]
 # Number of rows summed at once.
 _CHUNK = 1000
-# With more rows than this, the fit absorbs a negligible part of the noise.
+# With more rows than this, the part of the noise that the fitted parameters absorb is neglected.
 _MANY = 1000
 
 
@@ -159,16 +159,16 @@ class Problem:
         return np.asarray(rows.wrench - self.predict(load, rows) - wrench)
 
     def hats(self, t_s: Array) -> Array:
-        """Return the weights (n, courses) of the bias knots, and of the bias before each zeroing, at these times."""
+        """Return the interpolation weights (n, courses) of the bias knots and of the offsets before each zeroing."""
         knots = _hats(self.knots, t_s)
         return np.hstack([knots, t_s[:, None] <= self.zeroed_s]) if len(self.zeroed_s) else knots
 
     def predict(self, load: MovingLoad, rows: MotionRows) -> Array:
-        """Return the wrench (n, 6) of the load alone."""
+        """Return the wrench (n, 6) that a load exerts according to the model, without random effects."""
         return wrench_of(load, rows.motion.earlier(load.delay_s, rows.rate))
 
     def smooth_columns(self, load: MovingLoad, motion: Motion) -> Array:
-        """Return the wrench's derivative (n, 6, k) for the effects rotation and yielding, shift, cable and load."""
+        """Return the wrench's derivative (n, 6, k) by the smooth effects: rotation, yielding, shift, cable, load."""
         R = nearest_rotation(motion.R_base_flange)
         turned = turn_columns(load, motion) @ self.turns(load, R)
         moved = _REACH_M * lever_columns(load, motion)
@@ -201,7 +201,7 @@ class Problem:
         return J, np.concatenate([slow, self.smooth_columns(load, motion), lever_columns(load, motion)], axis=2)
 
     def drift(self, effects: Array) -> Array:
-        """Return the bias (courses, 6) at the knots and before each zeroing."""
+        """Return the bias (courses, 6) in the effects: at the knots, then the offset before each zeroing."""
         return effects[: 6 * self.courses].reshape(-1, 6)
 
     @property
@@ -211,7 +211,7 @@ class Problem:
         return slice(start, self.basis.shape[1] - 3)
 
     def unseen(self, load: MovingLoad, residuals: Array) -> Array:
-        """Return a root (n, 6, k) of the covariance of the rows due to smooth errors of the arm and a cable.
+        """Return a matrix A (n, 6, k): A A' is the covariance of the rows due to smooth errors of arm and cable.
 
         The arm's error has its expected size, and that of the cable is the smooth excess of the residuals (n, 6).
         """
@@ -298,9 +298,9 @@ class Problem:
         return T.T @ H @ T, T.T @ b, chi2
 
     def absorb(self, load: MovingLoad, rows: MotionRows, solved: "Solution") -> Array:
-        """Return a root (n, 6, k) of the covariance of the prediction.
+        """Return a matrix A (n, 6, k): A A' is the covariance of the predicted wrenches of the rows.
 
-        It has no columns before the first solution, or if there are so many rows that the covariance is negligible.
+        A has no columns before the first solution, or if so many rows make the covariance negligible.
         """
         if not solved.step.size or len(rows) > _MANY:
             return np.zeros((len(rows), 6, 0))
@@ -310,7 +310,7 @@ class Problem:
         return np.asarray(np.concatenate([J, by_effects @ self.basis], axis=2) @ (basis @ inverse_root))
 
     def components(self, sizes: Mapping[str, float], load: MovingLoad) -> tuple[Array, NDArray[np.bool_], float]:
-        """Return the prior precision of load and effects, which are estimated, and -log det for the components."""
+        """Return prior precision, whether each unknown is estimated, and -log det of the components' precision."""
         total = SIZE + self.basis.shape[1]
         P, on, log_det = np.zeros((total, total)), np.ones(total, np.bool_), 0.0
         for name, (places, precision) in self.groups.items():
@@ -338,7 +338,7 @@ class Problem:
         H, b, chi2 = sums
         P, on, log_det = self.components(sizes, load)
         value = np.concatenate([load.vector, self.basis.T @ effects])
-        removed = np.where(on, 0.0, -value)  # the coefficients of an absent component are set to 0
+        removed = np.where(on, 0.0, -value)  # absent components: coefficients become 0
         chi2 += float(removed @ H @ removed - 2 * b @ removed)
         b, value = b - H @ removed, np.where(on, value, 0.0)
         rows, residuals = self.constraints.measurements(load.static)
@@ -371,7 +371,7 @@ class Problem:
         load: MovingLoad,
         effects: Array,
     ) -> Array:
-        """Return -2 log restricted likelihood (k,) of trial sizes of one component, relative to size 0."""
+        """Return -2 log restricted likelihood (k,) for trial standard deviations of one component, minus that for 0."""
         H, b, _ = sums
         places, precision = self.groups[name]
         P, on, _ = self.components({**sizes, name: 0.0}, load)
@@ -405,9 +405,9 @@ class Solution:
     cost: float
     """Chi2 of rows and priors after the step."""
     criterion: float
-    """-2 log restricted likelihood of the component sizes, up to a constant."""
+    """-2 log restricted likelihood of the standard deviations of the components, up to a constant."""
     basis: Array
-    """Scaled basis of the estimated unknowns, one column each."""
+    """Scaled basis of the estimated unknowns: one column for each of them."""
     factor: tuple[Array, bool]
     """Cholesky factor of the scaled information matrix."""
 

@@ -30,9 +30,9 @@ MEAN_S = 0.01
 # Rows whose filter window contains a longer gap (or, in a slower stream, a gap of three periods) are left out.
 GAP_S = 0.06
 
-# Longer gaps are rejected: the times belong to two recordings, or are wrong.
+# Longest gap in the times of a recording, s. Longer ones mean two recordings or wrong times, and are rejected.
 LONGEST_GAP_S = 86400.0
-# A longer typical step, s, suggests times in one of these units. The number is the longest step for that unit.
+# A typical step longer than this, s, means that the times are in another unit. Each unit has a longest step.
 LONGEST_STEP_S = 0.25
 _TIME_UNITS = (("ms", 300.0), ("µs", 3e5), ("ns", np.inf))
 # Largest time, s: the number of 10 ms intervals must fit in 64 bits.
@@ -52,12 +52,12 @@ _LEAST_SCATTER_NS = 1e4
 CLOCK_TOLERANCE, RATE_TOLERANCE = 2e-4, 3e-3
 """Relative error of a device's clock, and of the nominal rate of a sensor without one, one sigma."""
 _IMPLAUSIBLE = 4.0
-# Times never jump and never run backwards: they approach a better estimate at this fraction of the elapsed time.
+# Time stamps never jump or go back: they approach a better estimate at this fraction of the elapsed time.
 _SLEW = 0.05
-# Distance from which the times approach a better estimate faster, and the fastest approach.
+# Beyond this distance (ns) from a better estimate the times approach it faster, up to this fraction.
 _FAR_NS, _FASTEST_SLEW = 2e8, 0.9
-# If this many successive buckets are later than the line by more than this, and by similar amounts, the line is
-# discarded: samples were lost without being counted.
+# If so many successive buckets are later than the line by similar amounts above this limit (ns), samples were lost
+# without being counted, and the line is discarded.
 _STEP_BUCKETS, _STEP_NS = 8, 5e6
 # A device whose count deviates from the line by more than this time has restarted.
 _LOST_S = 1.0
@@ -129,7 +129,7 @@ class SampleClock:
         return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
 
     def _note(self, x: float, y: float) -> None:
-        """Keep the least delayed sample of each bucket, and fit the line below these samples."""
+        """Keep the least delayed sample of each quarter of a second, and fit the line below these samples."""
         width = _BUCKET_S * 1e9 / self._slope
         if not self._points or x // width > self._points[-1][0] // width:
             self._points.append((x, y))
@@ -148,7 +148,7 @@ class SampleClock:
             error = (above_ns + _LEAST_SCATTER_NS) / ((self._points[-1][0] - self._points[0][0]) * self._nominal_ns)
             weight = 1 / (1 + (error / self._tolerance) ** 2)
             if abs(slope / self._nominal_ns - 1) > _IMPLAUSIBLE * self._tolerance:
-                # too fast for a clock drift: the delay is growing
+                # too fast for a drift of the clock: the transmission delay grows
                 weight = 0.0
             self._slope = weight * slope + (1 - weight) * self._nominal_ns
         self._offset = min(b - self._slope * a for a, b in self._points)
@@ -261,7 +261,7 @@ class Means:
         # A mean with almost no weight, from samples at the edge of its interval, carries no information.
         sums = sums[sums[:, 0] > _LEAST_WEIGHT]
         t_s = sums[:, 1] / sums[:, 0]
-        new = np.diff(t_s, prepend=-np.inf) > MEAN_S / 10  # in a slow stream two means may hold the same single sample
+        new = np.diff(t_s, prepend=-np.inf) > MEAN_S / 10  # two means of a slow stream may hold one sample
         return t_s[new], sums[new, 2:] / sums[new, :1]
 
 
@@ -274,7 +274,7 @@ def require_seconds(t_s: Array, name: str) -> None:
 
 
 def _sum_cells(cell: NDArray[np.int64], sums: Array) -> tuple[NDArray[np.int64], Array]:
-    """Add up the sums that belong to the same cell; return the cells in ascending order, and the sums of each."""
+    """Add up the sums of each 10 ms interval; return the interval numbers in ascending order, and their sums."""
     order = np.argsort(cell, kind="stable")
     cell = cell[order]
     first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
@@ -407,7 +407,7 @@ def _continuous_quaternions(values: Array) -> Array:
 
 
 def _has_samples(t_s: Array, start_s: float, end_s: float) -> bool:
-    """Whether a sample lies between the two times; parts of a long gap are skipped."""
+    """Whether a sample lies between two times; if not, this part of the recording is a gap and is skipped."""
     before, after = np.searchsorted(t_s, [start_s, end_s])
     return bool(after > before)
 
@@ -416,7 +416,7 @@ def _chunk(
     wrench: tuple[Array, Array], poses: tuple[Array, Array], grid: Array, kernel: Array, step: int
 ) -> tuple[Array, ...]:
     """Return times, wrenches, motion columns, their rates and speeds of the rows without a gap in the filter window."""
-    rate_kernel = np.convolve(kernel, [-0.5 / MEAN_S, 0.0, 0.5 / MEAN_S])  # filters and differentiates
+    rate_kernel = np.convolve(kernel, [-0.5 / MEAN_S, 0.0, 0.5 / MEAN_S])  # filters and differentiates at once
     kernel = np.pad(kernel, 1)
     (y, whole_w), (pose, whole_p) = _interpolate(grid, *wrench), _interpolate(grid, *poses)
     fits = np.einsum("nkw,wd->dnk", sliding_window_view(pose, len(_FIT), axis=0), _FIT)
@@ -428,7 +428,7 @@ def _chunk(
     W = skew(omega)
     Omega = skew(alpha) + W @ W
     a = np.einsum("nji,nj->ni", R, acceleration)
-    motion = Motion(R + MEAN_S**2 / 12 * R @ Omega, a, Omega)  # R as its mean, like the wrench
+    motion = Motion(R + MEAN_S**2 / 12 * R @ Omega, a, Omega)  # R becomes its mean over 10 ms, like the wrench
     speed = np.linalg.norm(omega, axis=1) + np.linalg.norm(velocity, axis=1) / _LEVER_M
     inner = slice(len(_FIT) // 2, len(grid) - len(_FIT) // 2)
     windows = sliding_window_view(motion.columns(), len(kernel), axis=0)[::step]

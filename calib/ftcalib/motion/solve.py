@@ -50,9 +50,9 @@ from ftcalib.sensor_matrix import Calibrated, Response
 
 # Shortest usable motion without a gap.
 LEAST_S = 5.0
-# Largest delay that is tried.
+# Largest delay between wrench and poses that is tried, s.
 FARTHEST_S = 1.5
-# A longer delay than this is reported as a clock error.
+# A delay of the wrench longer than this, s, is reported as a clock error.
 OFFSET_S = 0.1
 # Largest residual delay at which scale and signs of the motion are reliable.
 ALIGNED_S = 0.02
@@ -63,7 +63,7 @@ SLOW_RAD_S = 0.15
 # Residual, as a share of the change of the wrench, below which the clocks agree; and the share of the residual that
 # must remain for another clock rate to be accepted.
 _FOLLOWS, _OTHER_RATE = 0.03, 0.5
-# Smallest difference of clock rates that is corrected, and the trial ratios relative to the ratio of the durations.
+# Smallest relative difference of clock rates that is corrected, and trial ratios relative to that of the durations.
 _SAME_RATE, _RATIOS = 3e-3, 1 + np.linspace(-0.06, 0.06, 49)
 # Interpolation error above which poses are too coarse for their motion; then only rows slower than this are used.
 _COARSE_RAD, _REST_RAD_S = 8e-3, 0.02
@@ -73,7 +73,7 @@ NARROW_DEG = 45.0
 # A parameter is determined if its sigma is below this share of its prior sigma.
 MEASURED = 0.3
 WRONG_HEIGHT_M = 3e-3
-# Share of rows in contact that limits a result.
+# A larger share of rows in contact limits the result.
 MOSTLY = 0.5
 # Residual, as a share of the change of the force, above which wrench and poses do not belong together.
 _UNEXPLAINED = 0.3
@@ -132,7 +132,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         require_seconds(t_s, f"the times of the {name}")
     coarse_rad = interpolation_error_rad(data[1])
     is_coarse = coarse_rad > _COARSE_RAD
-    # Rows at rest contain no information about positions.
+    # Poses too coarse for motion leave only rows at rest, which contain no information about positions.
     positions = data[1][1].shape[1] == 12 and not is_coarse
     limit_rad_s = _REST_RAD_S if is_coarse else np.inf if positions else SLOW_RAD_S
     data, zeroed_s = _without_zeroing(*data)
@@ -141,7 +141,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     mistakes, undo = _find_mistakes(data, rows, known, g_m_s2) if positions else ([], unchanged)
 
     def rows_at(delay_s: float) -> tuple[MotionRows, MotionRows]:
-        """Return the corrected rows at a delay, and those of them that are used."""
+        """Return the rows of wrench and motion at a delay, without mistakes, and those slow enough to be used."""
         others = undo(motion_rows(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), rows.row_s))
         return others, _select_rows(others, limit_rad_s)
 
@@ -163,7 +163,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     places = places[:: max(1, len(places) // JUDGED_ROWS)]
     quality = judge_motion(Case(_static_estimate(used, best, places), setup=setup, known=known, g_m_s2=g_m_s2))
     findings = list(causes)
-    if verdict_of(causes) != "rejected":  # a rejecting cause would explain all other findings
+    if verdict_of(causes) != "rejected":  # else the cause explains all others
         # Torques about a TCP put the load behind the sensor, as reversed torques do.
         elsewhere = any(cause.code in ("torques_about_tcp", "poses_of_tcp") for cause in causes)
         findings += [each for each in quality.findings if not (elsewhere and each.code == "torques_reversed")]
@@ -223,8 +223,8 @@ def _fit_at_delay(
 def _causes(
     mistakes: list[Finding], ratio: float, zeroed_at_s: Array, coarse_rad: float, share: float
 ) -> list[Finding]:
-    """Return findings about what was corrected or left out before the fit."""
-    if ratio != 1:  # different clock rates explain a scale of the acceleration
+    """Return findings about what was corrected (mistakes, clocks, zeroings) or left out before the fit."""
+    if ratio != 1:  # explains a wrong scale of the acceleration too
         mistakes = [each for each in mistakes if each.code not in ("clock_rate", "wrench_compensated")]
         mistakes.append(Finding.of("clocks_differ", ratio=ratio))
     zeroed = [Finding.of("zeroed", at_s=zeroed_at_s)] if len(zeroed_at_s) else []
@@ -305,7 +305,7 @@ def _require_enough_motion(rows: MotionRows, best: MotionFit, known: Known | Non
     if mounting_rad < 0.3 and sigma_N < 0.5 * weight_N:
         return
     if known is not None:
-        return  # the verdict reports the uncertainty
+        return  # with known values, only the verdict reports it
     observability = assess(_orientations(rows), best.load.static)
     if observability.ambiguities:
         reason = ": ".join(observability.ambiguities[:2])
@@ -381,7 +381,7 @@ def _motion_findings(
     positions: bool,
     is_coarse: bool = False,
 ) -> list[Finding]:
-    """Return the findings that only a recording in motion can have."""
+    """Return findings about delay, missing positions, height and contacts, which only a recording in motion has."""
     sigma, findings = np.sqrt(np.diag(best.covariance)), list[Finding]()
     if abs(motion.delay_s) > OFFSET_S and not is_coarse:  # rows at rest do not show a delay
         findings.append(Finding.of("clock_offset", delay_s=motion.delay_s))

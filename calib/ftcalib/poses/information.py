@@ -192,7 +192,7 @@ def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters 
     gap n (weight / sigma_force_N)².
     """
     if len(R_base_flange) < 3:
-        return 0.0, None  # the solutions form a continuum
+        return 0.0, None  # the second solutions form a continuum: the gap is zero
     gap, other = second_minimum(R_base_flange, guess.parameters)
     if other is None:
         return gap, None
@@ -218,7 +218,7 @@ class _Variance:
         self._null = V[:, ~observable]
 
     def __call__(self, rows: Array) -> Array:
-        """Return the variances (k,) of rows (k, 15) times the error vector."""
+        """Return the variances (k,) of the products of rows (k, 15) and the error vector."""
         scaled = rows * self._scale
         blind = ((scaled @ self._null) ** 2).sum(axis=1) > OBSERVABLE * (scaled**2).sum(axis=1)
         return np.where(blind, np.inf, ((scaled @ self._root) ** 2).sum(axis=1))
@@ -227,7 +227,7 @@ class _Variance:
 def _weight_and_tilt_rows(guess: Guess) -> Array:
     """Return the derivatives (3, 15) of weight, alpha and beta with respect to the error coordinates."""
     F_b = guess.parameters.gravity_force_base_N
-    turn = skew(F_b / guess.weight_N**2)  # of a small rotation of F_b: cross(F_b, dF_b) / weight²
+    turn = skew(F_b / guess.weight_N**2)  # small rotation of F_b: cross(F_b, dF_b) / weight²
     alpha, beta = guess.tilt_alpha_rad, guess.tilt_beta_rad
     axis_of_alpha = np.array([np.cos(beta), 0.0, -np.sin(beta)])
     rows = np.zeros((3, 15))

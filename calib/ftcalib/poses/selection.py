@@ -24,13 +24,13 @@ from ftcalib.poses.information import (
 
 Indices = NDArray[np.intp]
 
-# Prior information about every parameter, in the units of `Guess.scale`: almost none.
+# Information about every parameter before the first pose, in the units of `Guess.scale`: almost none.
 PRIOR = 1e-4
-# Weight of the second term of the criterion, which penalises gravity directions in one plane.
+# Weight of the second term of the criterion of `choose`, which penalises gravity directions in one plane.
 WEIGHT_OF_PLANE = 0.3
 # Smallest number of poses that determines all parameters.
 FEWEST = 4
-# Sufficient gap to the second solution (`second_basin`).
+# Gap to the second solution (see `second_basin`) from which no poses are added to widen it.
 LEAST_GAP = 0.05
 MOST_SWEEPS = 20
 LEAST_GAIN = 1e-6
@@ -122,7 +122,7 @@ def choose(R_candidates: Array, n: int, guess: Guess) -> Indices:
 
     def gains(chosen: list[int]) -> Array:
         total = np.zeros(len(R_candidates))
-        for candidates, M in terms:  # each term is trace(M C) with a covariance C
+        for candidates, M in terms:  # each term of the criterion has the form trace(M C) with a covariance C
             rows = candidates[chosen].reshape(-1, len(M))
             total += _gains(candidates, _covariance_from(PRIOR * np.eye(len(M)) + rows.T @ rows), M)
         return total
@@ -210,7 +210,7 @@ def _contradiction(R_candidates: Array, guess: Guess, other: Parameters) -> Arra
 
 
 def _gains(rows: Array, C: Array, M: Array) -> Array:
-    """Return the decrease (m,) of trace(M C) by the rows (m, r, p) of each candidate."""
+    """Return the decrease (m,) of trace(M C) that each candidate with the Jacobian rows (m, r, p) would cause."""
     JC = rows @ C
     solved = np.linalg.solve(JC @ np.swapaxes(rows, 1, 2) + np.eye(rows.shape[1]), JC)
     return np.asarray(np.einsum("mrp,mrp->m", solved, JC @ M))
@@ -223,9 +223,9 @@ def _covariance_from(information: Array) -> Array:
 # Selection of poses for a verification: far from the poses of the fit, and able to identify what has changed.
 
 FEWEST_TO_VERIFY = 2
-# The poses are chosen from this share of the candidates, those farthest from the fit.
+# Share of the candidates, those farthest from the poses of the fit, from which verification poses are chosen.
 FARTHER_SHARE = 0.5
-# Assumed tool; the choice hardly depends on it.
+# Tool that the choice of verification poses assumes; the choice hardly depends on it.
 TOOL = Guess(mass_kg=1.0, sigma_force_N=0.02, sigma_torque_Nm=0.001)
 # (15,) usual changes of mounting, gravity force, force bias, centre of mass and torque bias, one standard deviation.
 USUAL_CHANGE = np.repeat([np.deg2rad(1.0), TOOL.weight_N * np.deg2rad(0.5), 0.5, 3e-3, 0.02], 3)

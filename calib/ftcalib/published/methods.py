@@ -160,7 +160,7 @@ def _best_yaw(M: Array, size: float, dof: int) -> float:
     minima = list[tuple[float, float]]()
     for yaw in stationary.tolist():
         cost, slope, curvature = derivatives(yaw)
-        if abs(slope) <= 1e-6 * size and curvature > 1e-9 * size:  # skip roots that are not on the unit circle
+        if abs(slope) <= 1e-6 * size and curvature > 1e-9 * size:  # only roots on the unit circle are angles
             minima.append((cost, yaw - slope / curvature))
     if not minima:
         raise NotObservable("the forces do not determine the yaw of the sensor: add poses that tilt the tool")
@@ -185,7 +185,7 @@ _GRAVITY_UNKNOWN: Mapping[str, Callable[..., ForceFit]] = {
 }
 
 CARLSON = ("carlson-relaxation", "carlson-cayley", *_GRAVITY_UNKNOWN)
-# Methods that compute the gravity force from the 24 special orientations.
+# Published methods that compute the gravity force from Yu's 24 special orientations.
 SPECIAL = ("srom", "mixed")
 BASELINES = ("vougioukas", "wang", "yang")
 PUBLISHED = (*SPECIAL, "lrom", *CARLSON, *BASELINES)

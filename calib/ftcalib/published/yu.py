@@ -19,14 +19,14 @@ from ftcalib.model import Array, Parameters, SPECIAL_R_flange_base, nearest_rota
 
 Indices = NDArray[np.intp]
 
-# Deviation from one of the 24 orientations that is always accepted: more than the error of calibrated kinematics.
+# Deviation of a pose from its special orientation that is always accepted: more than the error of a calibrated arm.
 TOLERANCE_RAD = np.deg2rad(1.0)
-# Largest deviation of rounded poses; a larger one is reported as a note.
+# A deviation from the special orientation that is larger than rounding causes; it is reported as a note.
 ROUNDING_RAD = np.deg2rad(0.05)
 
-# Largest accepted deviation, because the common rotation of the base is itself uncertain if all poses deviate.
+# Largest accepted deviation: 1.3 times the tolerance, because the estimated rotation of the base is uncertain too.
 _RECOGNISED_RAD = 1.3 * TOLERANCE_RAD
-# Distance between the invariants of `_likely_members` for poses 2° apart.
+# Poses 2° apart differ by this much in the invariants of `_likely_members`.
 _NEIGHBOURS = 0.065
 
 # Numbers of the orientations whose forces are added and subtracted: p_kj for k, j = 1, 2, 3 (eqs 17-23).
@@ -113,7 +113,7 @@ def lrom(R_base_flange: Array, wrench: Array) -> Parameters:
     A9 = np.einsum("kl,ni->nkli", np.eye(3), wrench[:, :3]).reshape(3 * n, 9)
     A6 = np.concatenate([-A, np.broadcast_to(-np.eye(3), A.shape)], axis=2).reshape(3 * n, 6)
     x6_of_x9 = -np.linalg.lstsq(A6, A9)[0]
-    H = np.linalg.qr(A9 + A6 @ x6_of_x9, mode="r")  # the same norm in at most nine rows
+    H = np.linalg.qr(A9 + A6 @ x6_of_x9, mode="r")  # triangular factor: the same norm in at most nine rows
     _, singular, Vt = np.linalg.svd(H)
     if singular[7] <= 1e-9 * singular[0]:
         raise NotObservable("LROM has several solutions for these poses: tilt the tool in more directions, or use ML.")
@@ -231,7 +231,7 @@ class _Match:
 
 
 def _best_match(R_base_flange: Array) -> _Match:
-    """Return the match with the common rotation that recognises most of the 24 orientations."""
+    """Return the `_Match` whose common rotation of the base recognises most of the 24 orientations."""
     matches = list[_Match]()
     for seed in chain([np.eye(3)], _likely_members(R_base_flange)):
         matches.append(_Match(R_base_flange, _common_rotation(R_base_flange, seed)))

@@ -32,16 +32,16 @@ _ATTEMPTS = 3
 _POLL_S = 0.05
 # Number of frames that are still read after the time-out: on a busy computer the process is late, not the reply.
 _LATE_FRAMES = 32
-# Required silence on the bus after a missed poll, so that a late half is not paired with the next reading.
+# Silence required after a missed poll, so that a late half of its reading is not paired with the next reading.
 _QUIET_S = 0.01
-# If the halves of a reading arrive in the wrong order, further frames are awaited for this time.
+# Time for which further frames are awaited if the two halves of a reading arrive in the wrong order.
 _STRAGGLER_S = 0.004
 _ANOTHER_SLOT = "choose another slot, with slot=0 to 15 in its address"
 # Counts per unit of firmware that does not report them, according to the manual.
 _MILLION = (1_000_000, 1_000_000)
 # Shortest poll period: about the capacity of a bus at 250 kbit/s. Faster polls would only load the CPU.
 _PERIOD_S = 1e-3
-# Heartbeats of CANopen nodes. On such a bus any lower identifier may be a command, even if none is sent at the moment.
+# Identifiers of heartbeats of CANopen nodes. On a bus with CANopen, any lower identifier may be a command.
 _HEARTBEATS = frozenset(range(0x701, 0x780))
 
 
@@ -116,7 +116,7 @@ class AtiCanSensor(StreamingSensor):
 
     @staticmethod
     def probe(channel: str, interface: str, bitrate: int | None, base: int) -> CanProbe:
-        """Return how to recognize a NETCANOEM with this base identifier; the parameters are those of `probe_can`."""
+        """Return the `CanProbe` of a NETCANOEM with this base identifier; the parameters are those of `probe_can`."""
         first = base << 4
         own = frozenset(range(first, first + 16))
         options = {} if interface == "socketcan" else {"interface": interface}
@@ -181,7 +181,7 @@ class AtiCanSensor(StreamingSensor):
             self._missed += 1
             self._await_quiet()  # a late half must not be paired with the next reading
             if self._missed > 1:
-                self._select_slot()  # a restart would have selected slot 0
+                self._select_slot()  # if the sensor has restarted, slot 0 is selected
             return NOTHING
         finally:
             self._malformed = self._bus.malformed
@@ -221,7 +221,7 @@ class AtiCanSensor(StreamingSensor):
     def _read_scale(
         self, firmware: codec.Firmware
     ) -> tuple[tuple[int, int], tuple[int, int], Literal["device", "configured", "assumed"]]:
-        """Return counts per unit, unit codes and their source. Raises `ConnectError` if two sources differ."""
+        """Return counts per unit, unit codes and their source. Raises `ConnectError` if sensor and address differ."""
         if firmware < codec.COUNTS_PER_UNIT_SINCE:
             counts = self._counts_per_unit or _MILLION
             if self._unit_codes is not None:
@@ -262,7 +262,7 @@ class AtiCanSensor(StreamingSensor):
         refuse_saturated(self.name, reading.gauges[np.newaxis])
 
     def _ask(self, op: Op, *args: int) -> list[bytes]:
-        """Send a request of the start-up sequence, repeatedly if necessary, and return the reply."""
+        """Send a request of the start-up sequence, repeat it if there is no reply, and return the reply."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(DeviceTimeout, ProtocolError):
                 self._request(op, bytes(args))

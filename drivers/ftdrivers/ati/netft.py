@@ -35,8 +35,8 @@ _SILENCE_S = 0.3
 # Number of start requests: a request is a datagram, which can be lost.
 _STARTS = 5
 _HTTP_S = 1.0
-# Without its reconnecting mode, pynetft ends the stream after one duplicate or late datagram. With so long a delay this
-# driver always detects a lost connection first.
+# Delay of pynetft's reconnecting mode, without which one duplicate or late datagram ends the stream. It is so long that
+# this driver always detects a lost connection first.
 _NEVER_S = 3600.0
 # Time-outs, s of real time: for the first sample of a block, and for each further one.
 _WAIT_S, _BATCH_S = 0.05, 0.002
@@ -157,9 +157,9 @@ class NetFtSensor(StreamingSensor):
 
     `counts` are the six values as sent, `seq` is the RDT sequence number, `t_device_s` is NaN: records carry no time.
     `wrench` is in the axes and about the origin of the transducer: the driver undoes the tool transformation. The
-    device subtracts its software bias. Both are facts, so a change is rejected after a reconnection. Nominal rate
-    and range are known if the configuration page contains them. Any status except a latched monitor condition raises
-    `DeviceFault`.
+    device subtracts its software bias. Both are in `DeviceInfo.facts`, so the driver rejects a sensor that has changed
+    them after a reconnection. Nominal rate and range are known if the configuration page contains them. Any status
+    except a latched monitor condition raises `DeviceFault`.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ class NetFtSensor(StreamingSensor):
     def _connect(self) -> DeviceInfo:
         # an OnRobot converter has no configuration pages
         page = b"" if self._onrobot else self._read_page("/netftapi2.xml")
-        rate_Hz, *_ = numbers_in(page, "comm?rdtrate") or [math.nan]  # both spellings exist
+        rate_Hz, *_ = numbers_in(page, "comm?rdtrate") or [math.nan]  # two spellings of the element exist
         self._nominal_Hz = rate_Hz if rate_Hz > 0 else math.nan
         undo = transformation_in(page)
         override = None
@@ -218,7 +218,7 @@ class NetFtSensor(StreamingSensor):
             sensor_host=self._host,
             rdt_port=self._rdt_port,
             http_port=self._http_port,
-            receive_timeout=_NEVER_S,  # in real time; this driver judges silences
+            receive_timeout=_NEVER_S,  # real time; silences are judged by this driver
             configuration_connect_timeout=self._http_s,
             configuration_timeout=self._http_s,
             deliver_samples_with_error_status=True,  # the status word names the fault
@@ -353,7 +353,7 @@ class NetFtSensor(StreamingSensor):
         return samples
 
     def _judge(self, status: int) -> None:
-        """Raise `DeviceFault` if the status is a fault; log a latched monitor condition once."""
+        """Raise `DeviceFault` if the status word contains a fault; log a latched monitor condition once."""
         if status not in {0, MONITOR_LATCHED}:
             raise DeviceFault(f"{self.name}: status {describe_status(status, self._bits, 32)}", UNUSABLE)
         if status and not self._warned:

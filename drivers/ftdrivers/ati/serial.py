@@ -36,7 +36,7 @@ _SILENCE_S = 0.2
 # Bytes for which one read waits, 4 ms of stream. Larger batches need less CPU but delay the guards. The records of a
 # batch share one time stamp, because evenly spread stamps would suggest a precision that they do not have.
 _BATCH_BYTES = 28 * modbus.RECORD_SIZE
-# If the error bit is set but the status word is clear, a byte was damaged. Three times in a row are a fault.
+# An error bit without a bit in the status word means a damaged byte; this many in a row are a fault.
 _MAX_RESTARTS = 3
 
 
@@ -64,7 +64,7 @@ class AtiSerialSensor(StreamingSensor):
         self._calibration_index = calibration
         self._port = SerialPort(self.name, port, _BAUD, even_parity=True, read_s=_READ_S, clock=clock)
         self._buffer = bytearray()
-        # Indices of bytes with wrong parity in the buffer.
+        # Indices of the bytes in the buffer that arrived with wrong parity.
         self._damaged: list[int] = []
         self._seq = self._status = self._restarts = 0
         self._slipped = False
@@ -138,7 +138,7 @@ class AtiSerialSensor(StreamingSensor):
         if suspect:
             keep &= ~flagged
         elif keep.any() and not flagged.any():
-            self._status &= ~modbus.ANY_ERROR  # the error has ended, so another one is logged again
+            self._status &= ~modbus.ANY_ERROR  # the error has ended; log the next one again
         gauges = records.gauges[:settled][keep]
         seq = self._seq + 1 + np.flatnonzero(keep)
         if self._last_good_ns is not None and len(gauges):
@@ -255,7 +255,7 @@ def _streams(data: bytes) -> bool:
     return False
 
 
-# Reads serial number and part number of the first stored calibration.
+# Read request for serial number and part number of the first stored calibration.
 _IDENTITY_REQUEST = modbus.read_registers(modbus.calibration_reads(1)[0][0], 20)
 
 

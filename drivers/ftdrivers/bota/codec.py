@@ -33,7 +33,7 @@ _SERIAL_REPLY = re.compile(rb"p,\d,(\d+),[^,\r\n]*,[^,\r\n]*,([ -~]*)")
 
 
 class Identity(NamedTuple):
-    """Name, serial number and firmware that a sensor reports; empty texts for what it does not report."""
+    """Name, serial number and firmware that a sensor reports; a text is empty if the sensor does not report it."""
 
     name: str
     serial: str
@@ -74,7 +74,7 @@ def decode_frame(data: bytes) -> Frame:
 
 
 def find_identity(text: bytes) -> Identity:
-    """Find the identity in the boot text of a sensor or in its reply to `ASK_SERIAL`, possibly among other bytes."""
+    """Find name, serial number and firmware in the boot text or the reply to `ASK_SERIAL`, even among other bytes."""
     if reply := _SERIAL_REPLY.search(text):
         return Identity(reply[2].decode("ascii").strip(), reply[1].decode("ascii"), "")
     found = (pattern.search(text) for pattern in (_NAME, _SERIAL, _FIRMWARE))

@@ -34,7 +34,7 @@ _USUAL_BAUDS = (460_800, codec.DEFAULT_BAUD)
 _FIRST_FRAMES = 8
 # Time-out for a sensor that boots, s.
 _BOOT_S = 5.0
-# If so many bytes, more than the boot text, contain no frame, the baud rate or the format is wrong.
+# If this many bytes, more than the boot text, contain no frame, the baud rate or the format is wrong.
 _NOISE_BYTES = 40 * codec.FRAME_SIZE
 # Time for which the port is closed, s. After a shorter time the sensor may not restart and prints no boot text.
 _CLOSED_S = 0.1
@@ -72,7 +72,7 @@ class BotaSensor(StreamingSensor):
         if sinc is not None and not 64 <= sinc <= 2048:
             raise ValueError(f"sinc is {sinc}; choose 64 to 2048")
         bauds = _USUAL_BAUDS if baud is None else (baud,)
-        # The port settings, with the last used baud rate first.
+        # Port settings to try, that with the last used baud rate first.
         self._ports = [(baud, SerialPort(self.name, port, baud, clock=clock)) for baud in bauds]
         self._port = self._ports[0][1]
         self._sinc = sinc
@@ -141,7 +141,7 @@ class BotaSensor(StreamingSensor):
         found, has_noise = list[str](), False
         for baud, port in tuple(self._ports):
             self._port, self._text, self._frames = port, b"", codec.deframer()
-            self._ports.sort(key=lambda port: port[0] != baud)  # this rate is tried first when the driver reconnects
+            self._ports.sort(key=lambda port: port[0] != baud)  # a reconnection tries this baud rate first
             if found:
                 self._clock.sleep(_CLOSED_S)
             port.open()
@@ -159,7 +159,7 @@ class BotaSensor(StreamingSensor):
         raise ConnectError(f"{self.name}: {', '.join(found)}", fix)
 
     def _configure(self, baud: int, sinc: int) -> None:
-        # Only what the address requests is changed; a sensor in another mode needs ?sinc=512 once.
+        # The sensor is configured only if the address requests it; a sensor in another mode needs ?sinc=512 once.
         self._command(codec.ENTER_SETUP)
         if not codec.find_identity(self._text).serial:  # the sensor has not just booted, so it must be asked
             with contextlib.suppress(DeviceTimeout):

@@ -48,27 +48,27 @@ class Halves:
 
     def __init__(self, period_s: float = math.nan, late_s: float = 0.0) -> None:
         self.silence_s = _SILENCE_S if math.isnan(period_s) else min(_SILENCE_S, period_s / 2)
-        """Time without a half, s, after which `silence` must be called."""
+        """Time, s, without a received half after which the reader must call `silence`."""
         self.lost = 0
-        """Number of fields that were due and were not accepted."""
+        """Number of fields that were due by the clock but were lost or not accepted."""
         self.quiet = True
-        """Whether no half has arrived since the last silence."""
+        """Whether no half of a field has arrived since the last call of `silence`."""
         self._period_ns = period_s * 1e9
         self._late_ns = late_s * 1e9
         self._number = 0
-        # Estimated arrival of the field `_number`.
+        # Estimated time of arrival of the last accepted field, whose number is `_number`.
         self._clock_ns: float | None = None
         self._first = b""
-        # Later fields, which are not confirmed by the clock yet.
+        # Fields that arrived later and are not accepted yet, because the clock has not confirmed them.
         self._waiting: list[Field] = []
-        # How many of the waiting fields arrived late or after a loss.
+        # Number of waiting fields that were fewer than due: they arrived late, or a field was lost.
         self._doubtful = 0
         self._in_turn = True
         # Whether the clock is valid for the waiting fields, because all halves have alternated since it was set.
         self._in_step = False
 
     def take(self, t_host_ns: int, data: bytes, *, second: bool) -> None:
-        """Add a received half."""
+        """Add a received half of a field: the first one, or the `second` one."""
         self.quiet = False
         if second != bool(self._first) or len(data) != codec.REPLY_SIZE // 2 or len(self._waiting) == _MOST_WAITING:
             self._in_turn = False
@@ -99,7 +99,7 @@ class Halves:
             self._set_clock(self._doubtful)
             if self._complete():
                 return self._accept()
-            self._set_clock(len(self._waiting), by_period=False)  # two deficits in a row: the sensor's clock shifted
+            self._set_clock(len(self._waiting), by_period=False)  # fields missing twice: the sensor's clock has shifted
         return []
 
     def _complete(self) -> bool:
@@ -120,17 +120,17 @@ class Halves:
         return fields
 
     def _set_clock(self, fields: int, *, by_period: bool = True) -> None:
-        """Set the clock by the last one of the oldest `fields`, and drop them.
+        """Set the clock to the arrival of the last of the oldest `fields` waiting fields, and drop these.
 
         A clock that was set before is moved by whole periods, because the host may be late.
         """
         clock_ns: float = self._waiting[fields - 1].t_host_ns
-        self._in_step = by_period and self._clock_ns is not None  # first fields may be late, so the next ones set it
+        self._in_step = by_period and self._clock_ns is not None  # the first may be late: the next confirm
         if self._clock_ns is not None:
             missed = max(1, math.floor((clock_ns - self._clock_ns) / self._period_ns + _EARLY))
             if by_period:
                 clock_ns = min(clock_ns, self._clock_ns + missed * self._period_ns)
-            if self._number:  # fields before the first accepted one are not counted
+            if self._number:  # losses before the first accepted field do not count
                 self._number += missed
                 self.lost += missed
         self._clock_ns = clock_ns
@@ -197,7 +197,7 @@ class RobotousCan(RobotousSensor):
 
     @staticmethod
     def probe(channel: str, interface: str, bitrate: int | None, _base: int) -> CanProbe | None:
-        """Return how to recognize a Robotous, on a bus at 1 Mbit/s only. The parameters are those of `probe_can`."""
+        """Return the `CanProbe` of a Robotous, on a bus at 1 Mbit/s only. The parameters are those of `probe_can`."""
         if bitrate not in {None, BITRATE}:
             return None
         command, *answers = IDS

@@ -115,7 +115,7 @@ DISCOVERY_S: Final = 3.0
 _SAME_CLOCK_MS: Final = 2.0
 # A stamp that is older than this by the clock of this computer comes from another clock.
 _LONGEST_WAY_MS: Final = 30.0
-# Time until a second publisher is known too.
+# Time after the first publisher of a topic within which a second one is discovered too.
 _OTHERS_S: Final = 0.5
 # Interval between two checks whether another node publishes too.
 _LOOK_S: Final = 1.0
@@ -203,7 +203,7 @@ def clock_diagnosis(ros: Node, newest_s: float) -> Diagnosis:
 
 
 def _number(info: Any) -> int | None:
-    """Return the number that the publisher gave a message; rclpy passes a mapping, or before Jazzy an object."""
+    """Return the publisher's sequence number of a message; rclpy passes a mapping, or before Jazzy an object."""
     found = info.get("publication_sequence_number") if isinstance(info, Mapping) else None
     return None if found is None or found >= _UNNUMBERED else int(found)
 
@@ -212,7 +212,7 @@ def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool
     found: list[Any] = []
     for _ in clock.looks(DISCOVERY_S):
         found = ros.node.get_publishers_info_by_topic(topic)
-        if found and not any(_UNNAMED in one.node_name for one in found):  # names of nodes arrive later
+        if found and not any(_UNNAMED in one.node_name for one in found):  # names of nodes arrive after their topics
             clock.sleep(_OTHERS_S)
             found = ros.node.get_publishers_info_by_topic(topic)
             break

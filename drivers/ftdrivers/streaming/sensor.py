@@ -47,7 +47,7 @@ class StreamLimits:
     settle_s: float = 0.05
     """Time for which an adapter may deliver buffered samples after a pause."""
     waited_s: float = 0.001
-    """A read that takes longer had to wait for a new sample, which means that the buffer is empty."""
+    """A read that takes longer than this has waited for a new sample, which means that the buffer was empty."""
     discard_s: float = 0.5
     """Time-out for emptying the buffer after a pause."""
     recover_s: float = 10.0
@@ -125,7 +125,7 @@ class StreamingSensor(ForceTorqueSensor):
         self.configured: dict[str, Fact] = {}
         """Facts `serial` and `range` from the user; they may be set before `open`. A device that reports another serial
         number is rejected. The range replaces the one that the device reports."""
-        # A subclass that knows the rate of its device sets this in `_connect`.
+        # Nominal sample rate; a subclass that knows the rate of its device sets it in `_connect`.
         self._nominal_Hz = math.nan
         self._thread: threading.Thread | None = None
         self._news = threading.Condition()
@@ -333,7 +333,7 @@ class StreamingSensor(ForceTorqueSensor):
         # Time of the newest sample, and time of the last completed read.
         self._heard_s = self._turn_s = self._clock.awake_s()
         self._pauses, self._pause, self._fresh_from_ns = 0, "", 0
-        # Whether a sample has arrived since the last pause.
+        # Whether a sample has arrived since the last pause of the reader.
         self._is_back = True
         self._taps = []
         self._arrivals.clear()
@@ -395,7 +395,7 @@ class StreamingSensor(ForceTorqueSensor):
                 raise self._stale(self._age_s())
 
     def _turn(self) -> float:
-        """Return the time since the last call, s, including the time for which the computer was suspended."""
+        """Return the time since the last call of this function, s, including a suspension of the computer."""
         before_s, self._turn_s = self._turn_s, self._clock.awake_s()
         return self._turn_s - before_s
 
@@ -421,7 +421,7 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _reconnect(self, error: DeviceError) -> None:
         """Try to reconnect to the same device. The first sample ends the interruption."""
-        if self._interruption is None:  # an interruption that has not ended is continued
+        if self._interruption is None:  # an earlier interruption has not ended: continue it
             self._interruption = error, self._clock.now_s() + self._limits.recover_s
             self._note(str(error))
         first, deadline_s = self._interruption
@@ -452,7 +452,7 @@ class StreamingSensor(ForceTorqueSensor):
             )
         with self._news:
             self._start_watching()
-            self._newest_ns, self._heard_s = self._clock.now_ns(), self._clock.awake_s()  # silences begin now
+            self._newest_ns, self._heard_s = self._clock.now_ns(), self._clock.awake_s()  # silence counts from now
 
     def _is_mine(self) -> bool:
         return self._thread is threading.current_thread()

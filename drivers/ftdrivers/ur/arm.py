@@ -43,7 +43,7 @@ from ftdrivers.ur.timing import STRICT, UrTiming
 log = logging.getLogger(__name__)
 
 _ARRIVED_RAD: Final = 1e-3
-# Largest set-point speed of an arm at rest, which reports exactly zero.
+# Set-point speed, rad/s, up to which an arm counts as at rest; an arm at rest reports exactly zero.
 _STANDING_RAD_S: Final = 1e-6
 _STILL_RAD_S: Final = 0.002
 # Time-out from the end of a sweep to standstill, s.
@@ -157,7 +157,7 @@ class UrArm(RobotArm):
         if control and self._control is None:
             self._control = self._opening(self._reader).open()
         if self._reader.look().robot_mode == ROBOT_RUNNING and (self._reader.reports_tcp or self._control is not None):
-            self.state()  # checks the model
+            self.state()  # also checks the model of the arm
 
     def _new_reader(self, **rate: float) -> Reader:
         return Reader(self._host, self._model, clock=self._clock, timing=self._timing, api_port=self._api_port, **rate)
@@ -303,7 +303,7 @@ class UrArm(RobotArm):
         self._set("gravity", checked_gravity(up_base_m_s2))
 
     def _set(self, what: str, *values: object) -> None:
-        """Let the control program set a value in the controller. Another program is not affected."""
+        """Let the control program call a setter of the controller. Raise if another program runs instead."""
         control = self._in_control()
         self._look_out()
         self._check_ours(control)

@@ -56,7 +56,7 @@ class ControlProcess(Control):
         self._replies: dict[int, dict[str, Any]] = {}
         self._lock = threading.RLock()  # re-entrant, because a signal handler may stop the arm during a call
         self._last_id = 0
-        self._ended = False  # true after the last reply was read
+        self._ended = False  # true when no further reply can come
         self._killed = False
         self._readers = [
             threading.Thread(target=read, args=(pipe,), name=f"ur-control-{read.__name__}", daemon=True)
@@ -95,7 +95,7 @@ class ControlProcess(Control):
             reader.join()  # the pipes have ended with the process
         for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
             if pipe is not None:
-                with suppress(OSError):  # an unread request
+                with suppress(OSError):  # a request was not read by the process
                     pipe.close()
 
     def _answer(self, to: int, timeout_s: float, look_out: LookOut) -> Any:
@@ -125,7 +125,7 @@ class ControlProcess(Control):
 
     def _loss(self) -> StreamBroken:
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(0.2)  # its pipe may close before the process ends
+            self._process.wait(0.2)  # pipes may close before the process ends
         return StreamBroken(
             f"the process that controls {self._host} ended (exit code {self._process.returncode})",
             "check the robot, then open the arm again",

@@ -48,7 +48,7 @@ class Kinematics:
             raise ValueError(f"theta, a, d and alpha are {[*numbers]}: give finite numbers, with a6 and alpha6 zero.")
         a[5] = alpha[5] = 0.0
         for joint, right in enumerate(_ALPHA_RAD):
-            if alpha[joint] * right < 0:  # the same arm, with the x axis of this frame reversed
+            if alpha[joint] * right < 0:  # reverses the x axis of the frame, which describes the same arm
                 theta[joint : joint + 2] += pi, -pi
                 a[joint], alpha[joint] = -a[joint], -alpha[joint]
         return cls(*(tuple(values.tolist()) for values in (theta, a, d, alpha)))
@@ -72,7 +72,7 @@ class Kinematics:
             along[joint + 1] = (along[joint] - d[joint]) / np.cos(alpha[joint])
         sideways = -along[1:] * np.sin(alpha)
         level = d - along[:-1] + along[1:] * np.cos(alpha)
-        level[1:3] = 0.0  # by the choice of the points; the sum of large numbers has rounding errors
+        level[1:3] = 0.0  # zero by the choice of the points; a sum of large numbers would have rounding errors
         return np.stack([a, sideways, level], axis=1)
 
 

@@ -26,16 +26,16 @@ log = logging.getLogger(__name__)
 
 
 class OwnProgram:
-    """Remembers whether the control program may run, and ends it through the services of the controller."""
+    """Record of whether the control program may still run; ends it through dashboard server or Robot API."""
 
     def __init__(self, timing: UrTiming) -> None:
         self._timing = timing
         self._services: ServicesOf | None = None
-        self._starting = False  # true between sending and starting: the program may start after a stop was requested
+        self._starting = False  # true after sending, until it has started: a stop may come before the start
         self._stops_itself = False
-        self._stop_wanted = threading.Event()  # set for an attempt in the background
+        self._stop_wanted = threading.Event()  # set while an attempt to stop runs in the background
         self.left_behind = False
-        """Whether the control program may run on the controller."""
+        """Whether the control program of this object may still run on the controller."""
 
     def is_sent(self, services: ServicesOf, *, stops_itself: bool) -> None:
         """Remember that the program was sent to the controller, where `services` can end it."""
@@ -132,7 +132,7 @@ class Opening:
         self.require_version()
         self.require_port()
         self.require_registers()
-        self.program.cancel_stop()  # a stop in the background would end the new program
+        self.program.cancel_stop()  # a pending background stop would end the new program
         self.reader.services.ask(self._prepare, timeout_s=self.timing.connect_s)
         self._require_no_program()
         control = self._start(path)

@@ -26,19 +26,19 @@ log = logging.getLogger(__name__)
 
 PORT: Final = 30001
 
-_HEADER: Final = struct.Struct(">iB")  # size of the whole package, type
+_HEADER: Final = struct.Struct(">iB")  # header of a package: its whole size, its type
 _ROBOT_STATE, _ROBOT_MESSAGE = 16, 20
-_MESSAGE: Final = struct.Struct(">QbB")  # time stamp, source, type
+_MESSAGE: Final = struct.Struct(">QbB")  # start of a message: time stamp, source, type
 _TEXT, _ERROR_CODE, _KEY, _EXCEPTION = 0, 6, 7, 10
-_KEY_HEAD: Final = struct.Struct(">iiB")  # code, argument, length of the title
+_KEY_HEAD: Final = struct.Struct(">iiB")  # key message: code, argument, length of the title
 _EXCEPTION_HEAD: Final = struct.Struct(">ii")  # line, column
 _CODE_HEAD: Final = struct.Struct(">iiiBI")  # code, argument, level, type of the data (4 bytes in old documents), data
 # Error code of a controller in local control that refuses a program. It may also close the connection.
 _READ_ONLY_CODE: Final = 210
 _KINEMATICS, _CONFIGURATION = 5, 6
-# Theta, a, d and alpha of all joints, after six checksums.
+# Layout of the kinematics sub-package: theta, a, d and alpha of all joints, after six checksums.
 _KINEMATIC_DATA: Final = struct.Struct(">24x24d")
-# Robot type in the configuration data, after limits, defaults and lengths of the arm.
+# Layout of the configuration sub-package: the robot type, after limits, defaults and lengths of the arm.
 _ROBOT_TYPE: Final = struct.Struct(">432xi")
 _ROBOT_TYPES: Final = MappingProxyType(
     {1: "UR5", 2: "UR10", 3: "UR3", 4: "UR16", 5: "UR18", 6: "UR8long", 7: "UR20", 8: "UR30", 9: "UR15"}
@@ -86,7 +86,7 @@ class Code:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A text that a program has sent."""
+    """A text that a program on the controller has sent with `textmsg`."""
 
     text: str
 

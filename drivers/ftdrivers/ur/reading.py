@@ -50,10 +50,10 @@ STATES_HZ: Final = 125.0
 # Largest number of samples in the queue of one follower, 33 minutes at 500 Hz.
 _MOST_UNREAD: Final = 1_000_000
 Received = tuple[int, list[bytes]]
-"""`t_host_ns` of one read, and its samples."""
+"""Time of receipt `t_host_ns` of one read, and the undecoded samples of this read."""
 # If more than this time passes between two turns, the reader was suspended or got no CPU time.
 _PAUSE_S: Final = 0.1
-# The first output, which follows the number of the recipe.
+# Layout of the time stamp: the first output in a package, after the number of the recipe.
 _TIMESTAMP: Final = struct.Struct(">xd")
 _QUICKEST_OF_S: Final = 0.5
 _MODEL_M: Final = 0.020
@@ -121,9 +121,9 @@ class Reader:
         self._changed = threading.Condition()
         # `t_host_ns` of the newest sample for a state or a status, and the sample.
         self._live: tuple[int, bytes] | None = None
-        # Number of samples after `_live`.
+        # Number of samples received after the one in `_live`.
         self._since_live = 0
-        # Times of the last read, of the last read with a sample, and of the read with `_live`.
+        # Times of the last read, of the last read that gave a sample, and of the read that gave the sample in `_live`.
         self._turn_s = self._read_s = self._live_s = clock.awake_s()
         self._t_device_s = math.nan
         self._lateness, self._late_s = _Lateness(), 0.0
@@ -258,7 +258,7 @@ class Reader:
             sample = self.look()
             if sample.tcp_offset is not None:
                 return sample, sample.tcp_offset
-            if before is not None and before == tuple(ask_tcp()):  # it was active when the sample was taken
+            if before is not None and before == tuple(ask_tcp()):  # unchanged, so active at the sample
                 return sample, before
         raise DeviceFault(f"the TCP of {self._host} changes repeatedly", "stop the program or client that sets it")
 
@@ -417,7 +417,7 @@ class Reader:
         return False
 
     def _end(self, failure: DeviceError) -> None:
-        """Let every later call raise this failure, unless there was an earlier one."""
+        """End the stream: every later call raises this failure, or the first failure if there was an earlier one."""
         with self._changed:
             self._failure = self._failure or failure
             self._changed.notify_all()

@@ -37,7 +37,7 @@ SETUP_INPUTS: Final = ord("I")
 START: Final = ord("S")
 DATA: Final = ord("U")
 
-_HEADER: Final = struct.Struct(">HB")  # size of the whole package, type
+_HEADER: Final = struct.Struct(">HB")  # header of a package: its whole size, its type
 _FORMATS: Final[Mapping[str, tuple[str, tuple[int, ...]]]] = {
     "UINT32": (">u4", ()),
     "INT32": (">i4", ()),
@@ -47,12 +47,12 @@ _FORMATS: Final[Mapping[str, tuple[str, tuple[int, ...]]]] = {
 }
 _INPUTS: Final[Mapping[str, str]] = {"INT32": "i", "DOUBLE": "d"}
 _RECEIVE_BYTES: Final = 65536
-# Full rates of the CB3 generation, and of the e-Series and later ones.
+# Highest RTDE rates, Hz: of the CB3 generation, and of the e-Series and later ones.
 _FULL_RATE_HZ: Final = (125.0, 500.0)
-# Registers for RTDE clients since PolyScope 3.9 and 5.3. Those below are for fieldbuses and PLCs.
+# Numbers of the registers for RTDE clients since PolyScope 3.9 and 5.3. Lower ones are for fieldbuses and PLCs.
 FIRST_REGISTER: Final = 24
 LAST_REGISTER: Final = 47
-# Rate at which the requests of a program are read.
+# Rate at which a client reads the requests of a program on the controller, Hz.
 _REQUESTS_HZ: Final = 125.0
 _SILENT_S: Final = 1.0
 
@@ -147,7 +147,7 @@ class _Connection:
         self._clock = clock
         self._deadline_s = clock.now_s() + timeout_s
         self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # a package must not wait for the next one
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # send each package at once
         self._timeout_s = timeout_s
         self._buffer = bytearray()
 
@@ -166,7 +166,7 @@ class _Connection:
     def _receive(self, timeout_s: float) -> None:
         """Wait for bytes, then read all that have arrived."""
         if timeout_s != self._timeout_s:
-            self._socket.settimeout(timeout_s)  # this is a system call
+            self._socket.settimeout(timeout_s)  # avoided if unchanged: it is a system call
             self._timeout_s = timeout_s
         received = b"\0" * _RECEIVE_BYTES
         while len(received) == _RECEIVE_BYTES:

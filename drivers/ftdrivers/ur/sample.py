@@ -96,7 +96,7 @@ _MODE_FIXES: Final = {
     20: "clear the emergency stop in the safety PLC, then power the arm on from the pendant",
     22: "clear the stop in the program that uses the safety API",
 }
-_SAFETY: Final = (  # the first row whose bits are set is the most specific one
+_SAFETY: Final = (  # the first row with a set bit is the most specific one
     (0b0_1110_0000, "emergency stop", "make the cell safe, release the button, power the arm on from the pendant"),
     (0b0_0000_0100, "protective stop", "find and remove its cause, then clear it on the pendant"),
     (0b0_0001_0000, "safeguard stop", "close the safeguard and reset it"),

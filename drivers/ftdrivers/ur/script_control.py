@@ -142,12 +142,12 @@ class ScriptControl(Control):
         self._changed = threading.Condition(threading.RLock())
         self._calling = threading.RLock()  # re-entrant, because a signal handler may stop the arm during a call
         self._beat = secrets.randbelow(_LARGEST)
-        # The last command: sequence number, code, numbers.
+        # The last command that was sent: sequence number, code, numbers.
         self._command: tuple[int, int, tuple[float, ...]] = (0, 0, (0.0,) * NUMBERS)
         self._report = _Report()
         self._beats = 0
         self._failure: DeviceError | None = None
-        # The last error of any program on the controller.
+        # The last error that the controller reported for any program.
         self._error: DeviceFault | None = None
         self._end_reason: DeviceError | None = None
         self._refusal: ProgramRefused | None = None
@@ -292,7 +292,7 @@ class ScriptControl(Control):
             while self._turn(stream):
                 pass
         finally:
-            self._fail("its thread has ended")  # no effect if the reason is known
+            self._fail("its thread has ended")  # keeps a reason that is known already
 
     def _connect(self) -> Subscription:
         timeout_s = self._timing.connect_s
@@ -349,7 +349,7 @@ class ScriptControl(Control):
                     StreamBroken(f"the connection to the control program on {self._host} was lost ({why})")
                 )
             self._changed.notify_all()
-        self._close_stream()  # no command can arrive later
+        self._close_stream()  # from now on no command can arrive
         return False
 
     def _close_stream(self) -> None:
@@ -383,7 +383,7 @@ class ScriptControl(Control):
             self._refuse(self._read_only("the controller closed the connection"))
 
     def _refuse(self, error: DeviceError) -> None:
-        """Store the reason why the program does not start, unless it has started."""
+        """Store the reason why the control program does not start; do nothing if it has started."""
         with self._changed:
             if self._report.token != self._token and self._refusal is None:
                 self._refusal = ProgramRefused(error.found, error.fix)

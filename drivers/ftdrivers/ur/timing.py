@@ -29,7 +29,7 @@ class UrTiming:
     still_s: float = 0.3
     """Time of uninterrupted rest after which vibrations of the structure have decayed."""
     ours_every_s: float = 0.1
-    """Interval between questions to the control program during a move."""
+    """Interval at which the control program is asked, during a move, whether it still runs."""
 
     # Time-outs of other processes, threads and servers are long in an emulated cell.
     connect_s: float = 2.0
@@ -41,11 +41,11 @@ class UrTiming:
     call_s: float = 2.0
     """Time-out for a reply of the control process, which takes 10 ms. Motion is watched meanwhile."""
     progress_s: float = 0.4
-    """Time-out for the progress of a move, which takes 0.03 ms. The guard is not called meanwhile."""
+    """Time-out for the question whether a move has ended, which takes 0.03 ms. The guard is not called meanwhile."""
     ours_s: float = 0.4
-    """Time-out for the answer of the control program, which takes two control cycles at most."""
+    """Time-out for the control program's answer that it still runs, which takes two control cycles at most."""
     ours_again_s: float = 1.0
-    """Value of `ours_s` when the arm is reopened."""
+    """Value of `ours_s` while an open arm is opened again."""
     ours_closing_s: float = 0.3
     """Value of `ours_s` when the arm is closed."""
     quit_s: float = 0.7
@@ -70,7 +70,7 @@ class UrTiming:
         """Return the time-outs of an emulated cell, whose processes may get little CPU time."""
         return cls(
             connect_s=30.0,
-            release_s=5.0,  # shorter than the others, because this wait always lasts until the time-out
+            release_s=5.0,  # shorter than other time-outs, because this wait always takes its full time
             starting_s=30.0,
             call_s=30.0,
             progress_s=30.0,
@@ -117,7 +117,7 @@ class Patience:
 
 @contextmanager
 def held(lock: RLock, clock: Clock) -> Iterator[None]:
-    """Hold a lock. A thread that waits for the lock continues to follow the clock of an emulated cell."""
+    """Hold a lock. While a thread waits for it, the thread continues to follow the clock of an emulated cell."""
     while not lock.acquire(timeout=0.02):
         clock.now_ns()
     try:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 
-ENOUGH_FRAMES = 5  # number of correct messages in a row that identify the stream of a sensor
+ENOUGH_FRAMES = 5  # intact frames in a row that identify the stream of a sensor
 
 
 def _table(polynomial: int) -> tuple[int, ...]:
@@ -95,7 +95,7 @@ class Deframer:
 
     @property
     def has_noise(self) -> bool:
-        """Whether bytes have arrived but no frame, which happens with a wrong baud rate or another device."""
+        """Whether bytes have arrived, but no intact frame: a sign of a wrong baud rate or of another device."""
         return not self.number and bool(self._skipped or self._buffer)
 
     def _next_number(self) -> int:

@@ -96,7 +96,7 @@ class AtiCanNode(CanSensor):
         self._booted_s = 0.0
 
     def power_up(self) -> None:
-        """See `Device`."""
+        """Set the state after power-up, see `Device.power_up`."""
         super().power_up()
         self._booted_s = 0.0
 

@@ -136,7 +136,7 @@ class AtiSerialBox(ModbusSensor):
         self._unlocked = False
 
     def power_up(self) -> None:
-        """See `Device`."""
+        """Set the state after power-up, see `Device.power_up`."""
         self._registers = dict.fromkeys(range(GAINS, SESSION + 1), 0)
         self._registers |= {BAUD_STORE: 0, BAUD: self._stored_baud_code}
         for slot in range(1, CALIBRATION_SLOTS + 1):

@@ -133,7 +133,7 @@ class BotaBox(SerialSensor):
         return self.sinc_length, self._next_baud_code, self.csv, self.calibrated
 
     def power_up(self) -> None:
-        """See `Device`."""
+        """Set the state after power-up, see `Device.power_up`."""
         self._was_open = False
         self._restart()
         if self.streaming_at_start:

@@ -224,7 +224,7 @@ class NetFtBox(Device[bytes]):
         self._socket.close()
 
     def power_up(self) -> None:
-        """See `Device`."""
+        """Set the state after power-up, see `Device.power_up`."""
         self._wire.clear()
         self._pacer.stop()
         self._bias = np.array(self.bias, dtype=float)

@@ -71,7 +71,7 @@ class RobotiqBox(ModbusSensor):
         self._stop_bytes = 0
 
     def power_up(self) -> None:
-        """See `Device`."""
+        """Set the state after power-up, see `Device.power_up`."""
         self._burst.clear()
         self._fall_silent()
         self._output = self._stop_bytes = 0

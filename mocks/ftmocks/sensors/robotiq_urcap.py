@@ -76,7 +76,7 @@ class RobotiqUrcap(Device[bytes]):
         self._clients.clear()
 
     def power_up(self) -> None:
-        """See `Device`."""
+        """Set the state after power-up, see `Device.power_up`."""
         self._wire.clear()
         self._pacer.start(STREAM_HZ)
 

@@ -315,7 +315,7 @@ class RobotousSerialBox(RobotousSensor[bytes], SerialSensor):
         return FASTEST_HZ[BAUD_RATES[self.baud_code]]
 
     def power_up(self) -> None:
-        """See `Device`."""
+        """Set the state after power-up, see `Device.power_up`."""
         self._line.clear()
         self._fall_silent()
         self.boot()

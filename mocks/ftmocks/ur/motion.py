@@ -117,7 +117,7 @@ class JointMove:
         self._dh, self._goal, self._speed, self._acceleration = dh, goal, speed, acceleration
 
     def begin(self, q: Vector6, _qd: Vector6, /) -> None:
-        """See `Path`."""
+        """Plan the motion from the current set-point, see `Path.begin`."""
         self._q0 = q
         self._travel = vector6([b - a for a, b in zip(q, self._goal, strict=True)])
         longest = max(abs(w) for w in self._travel)
@@ -129,7 +129,7 @@ class JointMove:
         self.duration_s = self._profile.duration_s
 
     def at(self, t: float) -> JointState:
-        """See `Path`."""
+        """Return the set-point at path time `t` with its derivatives, see `Path.at`."""
         if t >= self.duration_s:
             return JointState(self._goal)
         share, speed, acceleration = (value / self._profile.length for value in self._profile.at(t))
@@ -159,7 +159,7 @@ class LineMove:
         self._X_flange_tcp, self._X_tcp_flange = X_flange_tcp, inverse_matrix(X_flange_tcp)
 
     def begin(self, q: Vector6, _qd: Vector6, /) -> None:
-        """See `Path`."""
+        """Plan the motion from the current set-point, see `Path.begin`."""
         self._q = q
         self._start = forward(self._dh, q) @ self._X_flange_tcp
         self._travel = self._goal[:3, 3] - self._start[:3, 3]
@@ -169,7 +169,7 @@ class LineMove:
         self.duration_s = self._profile.duration_s
 
     def at(self, t: float) -> JointState:
-        """See `Path`."""
+        """Return the set-point at path time `t` with its derivatives, see `Path.at`."""
         if self._profile.length == 0.0:
             return JointState(self._q)
         share, speed, acceleration = (value / self._profile.length for value in self._profile.at(t))
@@ -261,11 +261,11 @@ class Servo:
         self.target = command.q
 
     def begin(self, q: Vector6, qd: Vector6, /) -> None:
-        """See `Path`."""
+        """Plan the motion from the current set-point, see `Path.begin`."""
         self._state = JointState(q, qd)
 
     def at(self, t: float) -> JointState:
-        """See `Path`."""
+        """Return the set-point at path time `t` with its derivatives, see `Path.at`."""
         left_s, self._t = t - self._t, t
         while self._commands and left_s > 0.0:
             goal, seconds, self._lookahead_s, self._gain = self._commands[0]
@@ -310,11 +310,11 @@ class Stop:
         self.duration_s = duration_s
 
     def begin(self, q: Vector6, qd: Vector6, /) -> None:
-        """See `Path`."""
+        """Plan the motion from the current set-point, see `Path.begin`."""
         self._q0, self._qd0 = q, qd
 
     def at(self, t: float) -> JointState:
-        """See `Path`."""
+        """Return the set-point at path time `t` with its derivatives, see `Path.at`."""
         if self.duration_s <= 0.0:
             return JointState(self._q0)
         rolled_s, left, braking = t - t * t / (2 * self.duration_s), 1.0 - t / self.duration_s, -1.0 / self.duration_s

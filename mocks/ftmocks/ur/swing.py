@@ -81,11 +81,11 @@ class Swing:
         self.duration_s = math.ceil(seconds / self.period_s) * self.period_s
 
     def begin(self, q: Vector6, _qd: Vector6, /) -> None:
-        """See `Path`."""
+        """Plan the motion from the current set-point, see `Path.begin`."""
         self._q0 = q
 
     def at(self, t: float) -> JointState:
-        """See `Path`."""
+        """Return the set-point at path time `t` with its derivatives, see `Path.at`."""
         q, qd, qdd = list(self._q0), [0.0] * 6, [0.0] * 6
         for size, sweeps in ((self._turn, TURNING), (self._lift, LIFTING)):
             for joint, swings, share in sweeps:

@@ -85,7 +85,7 @@ class CanSensor(PtyDevice[CanFrame]):
         """Return another node's frame, which a careless client could take for a frame of the sensor."""
 
     def power_up(self) -> None:
-        """See `Device`."""
+        """Set the state after power-up, see `Device.power_up`."""
         self._adapter = SlcanAdapter()
         self._answers = b""
         self._wire.clear()
