@@ -35,7 +35,7 @@ SLOTS = 30
 LEAD_NS = 10_000_000
 """Lead of the clock over the slowest slot, ns: less than any time-out, at least the period of the slowest sensor."""
 DEBT_NS = 200_000_000
-"""Largest delay behind real time that the clock catches up, ns."""
+"""Delay behind real time that the clock can catch up, ns; a longer delay is lost time."""
 PATIENCE_S = 10.0
 """Time after which the clock no longer waits for a process, until the process follows again, s of real time."""
 SUSPECT_S = 0.1
@@ -53,12 +53,12 @@ class CellClock:
     Parameters
     ----------
     real_ns
-        The computer's clock, ns. A test passes a clock that it advances itself.
+        Returns the time of the computer's clock, ns. A test passes a clock that it advances itself.
     """
 
     def __init__(self, real_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self.real_ns = real_ns
-        """The computer's clock, for time-outs of clients in real time."""
+        """Returns the time of the computer's clock, ns, for time-outs in real time."""
         self._descriptor = os.memfd_create("emulated-cell-clock")
         os.ftruncate(self._descriptor, 8 * (_HEAD + 2 * SLOTS))
         fcntl.flock(self._descriptor, fcntl.LOCK_EX)
@@ -68,12 +68,12 @@ class CellClock:
         self._page[2] = SLOTS
         self._page[0] = PAGE_VERSION
         self._lost_ns = 0
-        """Real time that the clock has lost and does not catch up, ns."""
+        """Real time that the clock has lost by waiting for threads and does not catch up, ns."""
         self._lock = threading.Lock()
         self._own: dict[int, int] = {}
-        """Time up to which each thread of the station has followed."""
+        """Time up to which each thread of the station, by its identifier, has followed the clock, ns."""
         self._held: dict[int, tuple[int, int]] = {}
-        """Slots that hold the clock: their time, and for how long they have held it, ns of real time."""
+        """For each slot that holds the clock back: its time, and since when it has not advanced, ns of real time."""
         self._end = weakref.finalize(self, _end, self._descriptor)
 
     @property

@@ -16,10 +16,10 @@ FOREVER_S = math.inf
 
 
 class Contact(Protocol):
-    """A contact of the tool."""
+    """A contact of the tool, or another force on it: it returns its wrench on the sensor."""
 
     def wrench(self, now_s: float, q: Vector6, R_base_sensor: Array) -> Array | None:
-        """Return the wrench (6,) on the sensor, in sensor axes about its origin; None after the contact has ended."""
+        """Return the wrench (6,) of the contact on the sensor, in sensor axes about its origin; None after its end."""
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def to_dh(model: str, frames: list[Array]) -> Dh:
             rows.append((math.atan2(last[1, 0], last[0, 0]), 0.0, last[2, 3], 0.0))
             break
         (zx, zy, zz), (px, py, pz) = (inverse_matrix(X) @ axis)[:3, 2:].T.tolist()
-        theta = math.atan(-zx / zy)  # direction of the common normal, nearest to zero
+        theta = math.atan(-zx / zy)  # angle of the common normal; of two, that nearest to zero
         c, s = math.cos(theta), math.sin(theta)
         alpha = math.atan2(zx * s - zy * c, zz)
         a, d = px * c + py * s, pz + zz * (py * c - px * s) / math.sin(alpha)

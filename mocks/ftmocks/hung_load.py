@@ -91,7 +91,7 @@ class HungLoad:
             hook = after
 
     def _pulled(self, free: Array) -> float:
-        """Return the constraint correction as a fraction of the string vector, for an unconstrained position (3,)."""
+        """Return the fraction of the string vector by which to correct a position (3,) to keep the string's length."""
         square = self._string_m**2
         along = float(free @ self._string)
         return (along - math.sqrt(along * along - square * (float(free @ free) - square))) / square

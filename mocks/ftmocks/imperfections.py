@@ -177,7 +177,7 @@ class Ringing(NamedTuple):
         held = -self.size * np.array(qdd) / np.abs(self.rates) ** 2
         moved = (self.held_rad - held) * (
             1.0 + 1j * self.rates.real / self.rates.imag
-        )  # the joint turns at the same speed
+        )  # so that the speed of the link does not jump
         amplitudes = moved if self.amplitudes is None else moved + self.amplitudes * np.exp(self.rates * t)
         if not any(qdd) and float(np.abs(amplitudes * self.rates**2).max()) < RUNG_OUT_RAD_S2:
             return self._replace(amplitudes=None, held_rad=0.0)

@@ -142,7 +142,7 @@ def _stack(m: _Rows) -> Array:
 def elbow(dh: Dh, q: Sequence[float]) -> Array:
     """Return the position (3,) of the elbow in the base: the point of joint axis 3 in the plane of the upper arm."""
     frame = forward(dh, q, joints=2)
-    return np.asarray(frame[:3, 3] - dh.d[1] * frame[:3, 2])  # undo d, which may be many metres in a real arm
+    return np.asarray(frame[:3, 3] - dh.d[1] * frame[:3, 2])  # undo the offset d, often many metres in a real arm
 
 
 def jacobian(dh: Dh, q: Sequence[float]) -> Array:
@@ -255,7 +255,7 @@ def inverse(dh: Dh, target: Array, near: Sequence[float]) -> Vector6 | None:
     branches = closed_form(MODELS[dh.model], target, near[5])
     seeds = [vector6([_nearest_turn(v, n) for v, n in zip(q, near, strict=True)]) for q in branches]
     seeds.sort(key=distance)
-    if not seeds:  # just out of reach of the nominal arm, and perhaps within reach of this one
+    if not seeds:  # the nominal arm just misses the target; this arm may still reach it
         seeds = [vector6(near)]
     for seed in seeds:
         q = refine(dh, target, seed)
@@ -313,7 +313,7 @@ def rotvec(R: Array) -> Array:
     angle = math.atan2(sin2, a + e + i - 1.0)
     if angle < 1e-6:
         return np.array([x, y, z]) / 2
-    if math.pi - angle < 1e-4:  # the antisymmetric part vanishes: use the symmetric part
+    if math.pi - angle < 1e-4:  # near 180° the antisymmetric part vanishes: use the symmetric one
         S = (R + R.T) / 2 + np.eye(3)
         column = S[:, int(np.argmax(np.diag(S)))]
         axis = column / np.linalg.norm(column)

@@ -72,7 +72,7 @@ def truth_from(options: Namespace) -> Truth:
         truth = replace(
             truth, force_bias_N=force_scale * truth.force_bias_N, torque_bias_Nm=torque_scale * truth.torque_bias_Nm
         )
-    if options.recording is not None:  # a recording has its own bias and noise
+    if options.recording is not None:  # a recording already contains bias and noise
         nothing = np.zeros(3)
         truth = replace(truth, force_bias_N=nothing, torque_bias_Nm=nothing, noise_force_N=0.0, noise_torque_Nm=0.0)
     given = {name: getattr(options, option) for option, name in VECTORS.items()}
@@ -215,7 +215,7 @@ class Station:
         if options.kinematics_message != "true":
             other = factory_kinematics.drawn(dh.model, options.seed + 1)
             self.robot.reported_dh = {"none": None, "wrong": other}[options.kinematics_message]
-        self._selector = selectors.SelectSelector()  # other selectors cannot wait for less than a millisecond
+        self._selector = selectors.SelectSelector()  # other selectors cannot wait for less than 1 ms
         self.server = self._listen()
         self._sensors: dict[str, Sensor] = {}
         self._ended = False
@@ -336,17 +336,17 @@ class Station:
             return {"error": f"{request['do']}: {error!r}"}
 
     def _delays(self) -> list[str]:
-        """Return the request for these options."""
+        """Return the control request that sets the delays given on the command line; none without such options."""
         delays = {"sensor_ms": self._options.sensor_delay_ms, "rtde_ms": self._options.rtde_delay_ms}
         given = {link: delay_ms for link, delay_ms in delays.items() if delay_ms is not None}
         return [json.dumps({"do": "delay", **given})] if given else []
 
     def _loads(self) -> list[str]:
-        """Return the request for --load."""
+        """Return the control request that hangs the load of the option --load; none without this option."""
         return [] if self._options.load is None else [json.dumps({"do": "hang", **self._options.load})]
 
     def _delay(self, request: dict[str, Any]) -> None:
-        """Set the delay between measuring and sending."""
+        """Execute the request "delay": set the delays from measuring to sending of sensors and RTDE."""
         given = {link: float(request[link]) for link in ("sensor_ms", "rtde_ms") if link in request}
         if not given:
             raise KeyError("sensor_ms")
@@ -362,7 +362,7 @@ class Station:
         self.robot.note("network", "delay", why=json.dumps(given))
 
     def _play(self, recording: Recording, request: dict[str, Any]) -> dict[str, Any]:
-        """Continue the recording at another time and at another pace."""
+        """Execute the request "play": continue the recording at another time or at another pace."""
         now_s = self._clock.now_s()
         at_s = float(request.get("at_s", recording.at_s(now_s)))
         recording.play(now_s, at_s, float(request.get("pace", recording.pace)))

@@ -45,7 +45,7 @@ class Workcell:
         self._sensors = sensors
         self._swing_deg = swing_deg
         self._empty: Truth | None = None
-        """The true quantities of the cell before a load was gripped."""
+        """True quantities of the cell before a load was gripped; None if the gripper is empty."""
         self.verbs: dict[str, Callable[[Request], dict[str, Any] | None]] = {
             "push": self._push,
             "bump": self._bump,

@@ -25,7 +25,7 @@ MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 """Tilt beta of the base for each mounting."""
 
 AHEAD_S = 0.02
-"""Time without a control cycle after which the arm stands still, s."""
+"""Time, s, for which a motion is extrapolated without a new control cycle; after it, the arm stands still."""
 BURST_GAP_S = 0.001
 """Largest gap between two bursts for which the true wrench at the end of the first burst is used again, s."""
 REMEMBERED = 16
@@ -188,7 +188,7 @@ class Cycle(NamedTuple):
     """Time of the cycle on the cell's clock."""
     q: Vector6
     motion: Callable[[float], JointState] | None
-    """Returns the joint state at a time of the cell's clock; None for an arm that stands at `q`."""
+    """Function that returns the joint state at a time of the cell's clock; None if the arm stands at `q`."""
 
 
 class World:
@@ -244,11 +244,11 @@ class World:
         self._moved: tuple[JointState, FlangeMotion] | None = None
         self._override: Array | None = None
         self._known: tuple[float, Array] = (-math.inf, _NOTHING)
-        """Time and wrench at the end of the last burst, where the next one begins."""
+        """Time and true wrench at the end of the last burst of readings, at which the next burst begins."""
 
     @property
     def now_s(self) -> float:
-        """The clock of the cell."""
+        """Time of the cell's clock, s."""
         return self.clock.now_s()
 
     @property
@@ -292,7 +292,7 @@ class World:
         return np.concatenate((force_bias_N, torque_bias_Nm)) + sum((d.at(t_s) for d in self.drifts), _NOTHING)
 
     def _joints(self, t_s: float) -> tuple[JointState, bool]:
-        """Return the joint state at a time, and whether the joints move."""
+        """Return the joint state at a time of the cell's clock, and whether the joints move."""
         known = self._joints_at
         if t_s not in known:
             if len(known) >= REMEMBERED:
@@ -349,7 +349,7 @@ class World:
         return load
 
     def _still_loads(self, q: Vector6) -> tuple[Array, Array]:
-        """Return the wrench of gravity on the sensor, and the wrench of gravity of the sensor on the flange."""
+        """Return two wrenches of gravity: of the load on the sensor, and of sensor and adapter on the flange."""
         truth, known = self.truth, self._still
         if known is not None and known[0] is q and known[1] is truth:
             return known[2]
@@ -427,7 +427,7 @@ class World:
         """Hang a load on a string, in place of any other; it is let go `swing_rad` off the vertical."""
         _, hook_m = self._hook(p_flange_hook_m)
         gravity_m_s2 = self.truth.gravity_m_s2
-        # a horizontal direction that differs from cell to cell
+        # a horizontal direction, drawn from the seed of the cell
         aside = cross(gravity_m_s2, np.random.default_rng([self.seed, 13]).normal(size=3))
         aside *= swing_rad / np.linalg.norm(aside)
         p_sensor_hook_m = self.truth.in_sensor(p_flange_hook_m)
@@ -457,20 +457,20 @@ class World:
         return lever_m, X[:3, 3] + lever_m
 
     def change_load(self, truth: Truth, name: str, contact: Contact) -> None:
-        """Set true quantities and a contact together: the table on which a grasped part lies still supports it."""
+        """Set true quantities and a contact in one step, so that a grasped part and its support appear together."""
         with self._lock:
             self.truth = truth
             self.touch(name, contact)
 
     def shift_payload(self, mass_kg: float | None, p_sensor_com_m: Array | None) -> None:
-        """Change the true payload, as if a part had been lost or added, or had slipped."""
+        """Change the true payload suddenly, as if a part had been lost or added, or had slipped in the gripper."""
         if mass_kg is not None:
             self.truth = replace(self.truth, mass_kg=mass_kg)
         if p_sensor_com_m is not None:
             self.truth = replace(self.truth, p_sensor_com_m=p_sensor_com_m)
 
     def read_always(self, reading: Array | None) -> None:
-        """Repeat this reading (6,) from now on; None measures again."""
+        """Return this reading (6,) for every measurement from now on; with None, measure again."""
         self._override = reading
 
 

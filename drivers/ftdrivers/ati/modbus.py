@@ -131,7 +131,7 @@ class Records:
     intact: NDArray[np.bool_]
     """(n,) whether the checksum is correct."""
     parity: NDArray[np.bool_]
-    """(n,) whether the parity of all bytes is correct. It does not show a slip: some adapters mark whole packets."""
+    """(n,) whether the parity of all bytes is correct. Bad parity proves no slip: some adapters mark whole packets."""
     error: NDArray[np.bool_]
     """(n,) error bit, which asks the host to stop the stream and read the status word."""
 

@@ -65,7 +65,7 @@ class Node:
         _stay_on_loopback()
         self.context = rclpy.Context()
         try:
-            rclpy.init(args=["ftdrive", *arguments], context=self.context)  # own context: no signal handlers
+            rclpy.init(args=["ftdrive", *arguments], context=self.context)  # own context: installs no signal handlers
             self.node = rclpy.create_node(name, context=self.context)
         except Exception as error:  # rclpy raises its own exceptions, some of them private
             with suppress(Exception):

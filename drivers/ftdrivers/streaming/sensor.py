@@ -330,7 +330,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._newest = NOTHING
         self._interruption = None
         self._opened_ns = self._newest_ns = self._clock.now_ns()
-        # Time of the newest sample, and time of the last completed read.
+        # Clock time of the newest sample, and of the last completed read.
         self._heard_s = self._turn_s = self._clock.awake_s()
         self._pauses, self._pause, self._fresh_from_ns = 0, "", 0
         # Whether a sample has arrived since the last pause of the reader.

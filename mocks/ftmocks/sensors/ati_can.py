@@ -22,7 +22,7 @@ from ftmocks.wires.slcan import CanFrame
 from ftmocks.wires.stream import CanSensor
 
 EMPTY_SLOT_STATUS = 0x8040  # bad active calibration, any error
-NO_ARGUMENT, ONE_ARGUMENT = (0, 1), (1,)  # accepted data lengths; an additional byte is tolerated
+NO_ARGUMENT, ONE_ARGUMENT = (0, 1), (1,)  # accepted data lengths by opcode; an additional byte is tolerated
 REQUEST_DLC = {
     0x0: NO_ARGUMENT,
     0x2: ONE_ARGUMENT,
@@ -122,7 +122,7 @@ class AtiCanNode(CanSensor):
             return []
         if len(request.data) not in REQUEST_DLC.get(opcode, ()):
             return []
-        identifier = request.identifier  # a reset below may change the base
+        identifier = request.identifier  # kept here, because a reset below may change the base identifier
         payloads = self._payloads(opcode, request.data[0] if request.data else 0)
         return [CanFrame(identifier + i, payload) for i, payload in enumerate(payloads)]
 

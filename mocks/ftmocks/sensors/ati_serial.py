@@ -41,7 +41,7 @@ STREAM_HZ = 7000.0
 RECORD_BYTES = 13
 CHARACTER_BITS = 11
 JAM_BYTES = 14
-JAM_PAUSE_S = 0.050  # after a longer pause, the jamming sequence must start again
+JAM_PAUSE_S = 0.050  # s; a longer pause restarts the jamming sequence
 MAX_READ = 64
 
 GAINS, OFFSETS, SESSION, STATUS, BAUD_STORE, BAUD = 0x0000, 0x0006, 0x000C, 0x001D, 0x001E, 0x001F
@@ -117,7 +117,7 @@ class AtiSerialBox(ModbusSensor):
     """
 
     address = 0x0A
-    frame_gap_s = 1.75e-3  # Modbus RTU: fixed above 19 200 baud
+    frame_gap_s = 1.75e-3  # pause that ends a Modbus RTU frame; fixed above 19 200 baud
     has_parity = True
 
     calibrations: Mapping[int, Calibration] = field(default_factory=lambda: {1: REFERENCE})

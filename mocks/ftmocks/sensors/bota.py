@@ -222,7 +222,7 @@ class BotaBox(SerialSensor):
         self._wire.put(self._as_received([text], self.baud_code))
 
     def _client_has(self, baud_code: int) -> bool:
-        """Return whether the client has this baud rate; without a terminal, the client has every baud rate."""
+        """Return whether the client's port is set to this baud rate; True if there is no terminal to show it."""
         return self._file < 0 or termios.tcgetattr(self._file)[5] == _SPEEDS[baud_code]
 
     def _as_received(self, frames: list[bytes], baud_code: int) -> list[bytes]:
@@ -249,7 +249,7 @@ class BotaBox(SerialSensor):
         return f"{status},{numbers},{timestamp_us},{self.temperature_C:.2f}\r\n".encode("ascii")
 
     def _run(self) -> None:
-        """Start the stream, whose time stamps count from power-up."""
+        """Start the stream of samples; its time stamps count from power-up."""
         self._stream_start_us = (self.clock.now_s() - self._powered_s) * 1e6
         self._pacer.start(1 / self.sample_s)
 

@@ -18,7 +18,7 @@ class Kind:
     scheme, query
         Scheme and options of the address; the path of the pseudo-terminal is between them.
     endpoint
-        Settings for a client that does not use such addresses.
+        Settings with which a client that does not use such addresses can connect.
     options
         Options of the emulator.
     settings

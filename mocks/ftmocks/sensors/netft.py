@@ -266,7 +266,7 @@ class NetFtBox(Device[bytes]):
                     self._socket.sendto(datagram, self._client)
 
     def _sample(self, count: int) -> None:
-        first = self._pacer.made - count  # number within this stream, from 0
+        first = self._pacer.made - count  # number of the sample within this stream, from 0
         if self._left is not None:
             count = max(0, min(count, self._left - first))
             self._pacer.made = first + count

@@ -58,7 +58,7 @@ class RobotiqBox(ModbusSensor):
     """
 
     address = 0x09
-    frame_gap_s = 2e-3  # 3.5 characters at 19200 baud
+    frame_gap_s = 2e-3  # pause that ends a request: 3.5 characters at 19200 baud
 
     firmware: tuple[str, int, int, int] = ("FTS", 2, 0, 1)
     serial: tuple[str, int] = ("FTS", 1234)

@@ -51,7 +51,7 @@ class RobotiqUrcap(Device[bytes]):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._clients: dict[socket.socket, bytes] = {}
-        """Remaining bytes of a reading for each client that did not accept all of it."""
+        """For each client, the remaining bytes of a reading of which its socket accepted only a part."""
 
     def start(self) -> Endpoint:
         """Start the URCap.

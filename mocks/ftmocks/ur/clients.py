@@ -9,7 +9,7 @@ from ftmocks.ur import api, dashboard, http_wire, primary
 from ftmocks.ur.robot import Robot
 from ftmocks.ur.uploads import start_upload, take_uploads
 
-BACKLOG_LIMIT_S = 10.0  # time after which a client that does not read is disconnected
+BACKLOG_LIMIT_S = 10.0  # s until a client that does not read is disconnected
 
 
 class Client(ABC):
@@ -104,7 +104,7 @@ class ScriptClient(Client):
     kind = "script"
 
     def on_bytes(self, buffer: bytearray) -> None:
-        """Start every complete program."""
+        """Take the complete programs from `buffer` and start them."""
         for upload in take_uploads(buffer):
             start_upload(self.robot, upload)
 
@@ -124,14 +124,14 @@ class PrimaryClient(Client):
         self._switches = self.robot.remote_switches
         self._every = self.robot.frequency_hz // primary.STATES_HZ
         self._seen = len(self.robot.events)
-        """Number of entries of the event log that were sent or are older than this connection."""
+        """Number of entries of the event log that need not be sent: sent already, or older than this connection."""
 
     def greeting(self) -> bytes:
-        """Return version, tolerances and a complete state."""
+        """Return the first bytes of a connection: version, tolerances and a complete robot state."""
         return primary.greeting(self.robot)
 
     def on_bytes(self, buffer: bytearray) -> None:
-        """Start every complete program."""
+        """Take the complete programs from `buffer` and start them."""
         by = f"{self.kind} port"
         for upload in take_uploads(buffer):
             command = primary.COMMANDS.get(upload.text.strip())
@@ -189,7 +189,7 @@ class DashboardClient(Client):
         return self._opened_remote and self._switches == self.robot.remote_switches
 
     def on_bytes(self, buffer: bytearray) -> None:
-        """Answer every complete line."""
+        """Take the complete lines from `buffer`, execute them as dashboard commands, and send the replies."""
         while b"\n" in buffer and self.open:
             line, _, rest = bytes(buffer).partition(b"\n")
             buffer[:] = rest
@@ -205,7 +205,7 @@ class ApiClient(Client):
     kind = "api"
 
     def on_bytes(self, buffer: bytearray) -> None:
-        """Answer every complete request."""
+        """Take the complete HTTP requests from `buffer` and answer them."""
         try:
             while self.open and (request := http_wire.take_request(buffer)):
                 status, answer = api.respond(self.robot, request.method, request.path, request.body)

@@ -46,7 +46,7 @@ def orientations(robot: Robot) -> list[Vector6]:
 
 
 def usual_rest_s(robot: Robot) -> float:
-    """Return the rest of the operator at each orientation, s."""
+    """Return the time for which the operator rests at each orientation, s."""
     return REST_S if robot.world.hung is None else REST_WITH_LOAD_S
 
 
@@ -74,6 +74,6 @@ def pendant_program(robot: Robot, rest_s: float) -> Upload:
 
 
 def _turned(angle: float, by: float) -> float:
-    """Return a rotated angle within one revolution."""
+    """Return an angle after a rotation, kept within one revolution."""
     turned = angle + by
     return turned if abs(turned) <= 2 * math.pi else math.remainder(turned, 2 * math.pi)

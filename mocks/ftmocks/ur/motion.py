@@ -90,7 +90,7 @@ class Path(Protocol):
 
     duration_s: float
     real_time: bool
-    """Whether the speed slider and the limiter are ignored."""
+    """Whether this motion ignores the speed slider and the trajectory limiter."""
 
     def begin(self, q: Vector6, qd: Vector6, /) -> None:
         """Plan the motion from the current set-point: angles (rad) and speeds (rad/s). Sets `duration_s`."""
@@ -113,7 +113,7 @@ class JointMove:
     real_time = False
 
     def __init__(self, dh: Dh, goal: Vector6, speed: float, acceleration: float) -> None:
-        Trapezoid(0.0, speed, acceleration)  # rejects impossible values before the motion
+        Trapezoid(0.0, speed, acceleration)  # rejects impossible speeds before the motion starts
         self._dh, self._goal, self._speed, self._acceleration = dh, goal, speed, acceleration
 
     def begin(self, q: Vector6, _qd: Vector6, /) -> None:
@@ -283,7 +283,7 @@ class Servo:
         return self._state
 
     def _pass(self, t: float, target: Vector6, rate: Vector6) -> None:
-        """Advance the time while the target moves with constant velocity."""
+        """Advance the spring by a time during which the target moves with constant velocity."""
         gain, damping = self._gain, self._gain * self._lookahead_s
         states = []
         for q, v, goal, u in zip(*self._state[:2], target, rate, strict=True):
@@ -380,7 +380,7 @@ class Arm:
         self.q = self.actual_q = q
         self.qd = self.actual_qd = self.qdd = ZERO6
         self.motion: Following | None = None
-        """Motion of the actual joints after the last cycle; None while they are at rest."""
+        """Motion of the actual joints, which lag the set-point, after the last cycle; None while they are at rest."""
         self.speed_fraction = 1.0
         """Speed slider, 0 to 1."""
         self.pushed_rad = ZERO6
@@ -388,14 +388,14 @@ class Arm:
         self.scaling = 1.0
         """Fraction of the speed that the trajectory limiter allows, 0 to 1."""
         self.paused = False
-        """Whether the arm should stand still on its path."""
+        """Whether the arm should pause: stand still on its path, and continue later."""
         self.pace = 1.0
         """Current speed of path time without the slider: `scaling`, 0 if paused, or a transition between them."""
         self.still_s = 0.0
         """Time for which the set-point has been at rest, s."""
         self._slider = 1.0
         self._rates = (1.0, 1.0)
-        """Speeds of path time: for servoj, and for all other paths, on which the slider acts."""
+        """Speeds of path time: for servoj, on which the speed slider does not act, and for all other paths."""
         self._off_rad = ZERO6
         self._paths: deque[Path] = deque()
         self._planned: Path | None = None
@@ -466,7 +466,7 @@ class Arm:
             self._follow([self._rundown()] if not self.at_rest else [])
 
     def step(self, dt: float, _t_s: float = 0.0) -> None:
-        """Advance by `dt` seconds to a time of the cell's clock.
+        """Advance set-point and actual joints by one control cycle of `dt` seconds.
 
         Raises
         ------

@@ -16,7 +16,7 @@ from ftmocks.ur.uploads import Upload, start_upload
 
 Request = dict[str, Any]
 Verb = Callable[[Request], dict[str, Any] | None]
-"""Executes a request, and returns the fields of its answer or None."""
+"""Function that executes a control request; it returns the fields of its answer, or None for an answer without any."""
 
 FOREIGN_PROGRAM_S = 5.0
 FOREIGN_SPEED_RAD_S = 0.3

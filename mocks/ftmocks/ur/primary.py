@@ -154,7 +154,7 @@ def state_package(robot: Robot, *, complete: bool = False) -> bytes:
 def _mode_data(robot: Robot) -> bytes:
     bits = SAFETY_BITS[robot.safety_mode]
     flags = (
-        True,  # real robot connected; real robot enabled
+        True,  # first two flags: real robot connected, and enabled
         True,
         robot.robot_mode in POWERED,
         bool(bits & _EMERGENCY_BIT),
@@ -181,7 +181,7 @@ def _cartesian_info(robot: Robot) -> bytes:
 
 def _kinematics_info(dh: Dh) -> bytes:
     nominal = dh == MODELS[dh.model]
-    alpha = [round(angle, 9) for angle in dh.alpha] if nominal else dh.alpha  # 1.570796327, as URSim reports it
+    alpha = [round(angle, 9) for angle in dh.alpha] if nominal else dh.alpha  # URSim reports pi / 2 as 1.570796327
     parameters = (dh.theta, dh.a, dh.d, alpha)
     checksums = [0xFFFFFFFF if nominal else zlib.crc32(_doubles(joint)) for joint in zip(*parameters, strict=True)]
     return struct.pack(">6I", *checksums) + b"".join(map(_doubles, parameters)) + struct.pack(">I", 0)

@@ -158,7 +158,7 @@ class Robot:
         self._joint_noise = np.random.default_rng([world.seed, 9])
         self._wrist_drift = WarmUp(imperfections.wrist_drift_N, world.now_s)
         self.reported_dh: Dh | None = world.dh
-        """Kinematics that the primary interface sends; None for none."""
+        """Kinematics that the primary interface sends to clients; None if it sends none."""
         self.limits = Limits(world.dh, settings.joint_limit_rad, settings.plane)
         self.frequency_hz = 125 if settings.polyscope[0] <= 3 else 500
         self.period_s = 1.0 / self.frequency_hz
@@ -170,7 +170,7 @@ class Robot:
         self.safety_mode = SafetyMode.NORMAL
         self.remote_switches = 0
         """Number of changes between local and remote control on the pendant."""
-        self.loaded_program: str | None = None  # path of the program
+        self.loaded_program: str | None = None  # path of the program file, as the dashboard reports it
         self.payload_kg = settings.payload_kg
         self.payload_cog_m = settings.payload_cog_m
         self.payload_inertia: Vector6 = ZERO6
@@ -184,7 +184,7 @@ class Robot:
         self.events: list[Event] = []
         """Event log: accepted and refused commands, program, safety, start and end of motion. The newest is last."""
         self.hand: Iterator[None] | None = None
-        """The operator who guides the arm by hand. Each `next` is one control cycle."""
+        """Motion of the operator who guides the arm by hand; each `next` runs one control cycle. None without one."""
         self._remote_control = True
         self._reduced = False
         self._program: ControllerProgram | None = None
@@ -252,7 +252,7 @@ class Robot:
 
     @property
     def measured_q(self) -> Vector6:
-        """Actual joint angles that the controller reports, rad, with new noise in every cycle."""
+        """Joint angles that the controller reports as actual, rad: the true ones with new noise in every cycle."""
         sd_rad = self.world.imperfections.joint_noise_rad
         if not sd_rad:
             return self.arm.actual_q
@@ -263,7 +263,7 @@ class Robot:
         return self._measured[1]
 
     def note(self, by: str, what: str, *, accepted: bool = True, why: str = "", **detail: Any) -> None:
-        """Add an entry to the event log."""
+        """Add an entry to the event log of the controller."""
         self.events.append(Event(self.clock.now_ns(), self.timestamp_s, by, what, accepted, why, detail))
 
     def _leaves_limits(self, before: Vector6) -> bool:
@@ -300,7 +300,7 @@ class Robot:
 
     @property
     def obstacle(self) -> str | None:
-        """Reason why no program may start now, or None."""
+        """Reason why no program may start now, as text; None if one may."""
         if self.robot_mode != RobotMode.RUNNING:
             return f"robot mode {self.robot_mode.name}"
         if self.safety_mode not in PERMITTED:
@@ -369,7 +369,7 @@ class Robot:
 
     @property
     def hand_obstacle(self) -> str | None:
-        """Reason why the arm cannot be moved by hand now, or None."""
+        """Reason why the arm cannot be moved by hand now, as text; None if it can."""
         return "a program plays" if self.runtime == Runtime.PLAYING else self.obstacle
 
     def hand_move(self, q: Vector6, speed_rad_s: float) -> None:
@@ -483,7 +483,7 @@ class Robot:
         self._watchdog_age_s = 0.0
 
     def write_inputs(self, fields: dict[str, Value]) -> None:
-        """Store input variables from a client."""
+        """Store the values of RTDE input variables that a client has written."""
         self._note_lost_command(fields)
         self.inputs.update(fields)
         if self._watchdog is not None and self._watchdog[0] in fields:
@@ -493,7 +493,7 @@ class Robot:
             self.arm.speed_fraction = min(1.0, max(0.0, fraction))
 
     def _note_lost_command(self, fields: dict[str, Value]) -> None:
-        """Log a command that no program will read."""
+        """Log a command that a client wrote into the registers while no program reads it."""
         for name in COMMAND_REGISTERS & fields.keys():
             command = fields[name]
             reader = self._program if self.runtime == Runtime.PLAYING else None
@@ -588,7 +588,7 @@ class Robot:
         return self._wrench[1]
 
     def zero_ft(self) -> None:
-        """zero_ftsensor: use the current reading as zero."""
+        """zero_ftsensor: subtract the current reading from later ones."""
         self._ft_zero = self._compensated()
 
     def _compensated(self) -> Array:

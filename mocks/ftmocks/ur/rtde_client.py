@@ -18,7 +18,7 @@ class RtdeLink:
 
     input_owners: dict[str, "RtdeClient"] = field(default_factory=dict)
     claimed: set[str] = field(default_factory=set)
-    """Input variables that a fieldbus owns, except those that a client owned before."""
+    """Input variables that an emulated fieldbus owns; it does not take those that a client owned before."""
     bad_inputs: list[str] = field(default_factory=list)
     """Descriptions of packages that violate the protocol."""
     delay_s: float = 0.0
@@ -82,7 +82,7 @@ class RtdeClient(Client):
         return self._outbox[0][0] - now_s if self._outbox else None
 
     def repeat(self) -> None:
-        """Send the last sample again to a client that sends commands."""
+        """Send the last sample again, if this client sends commands."""
         if self._started and self._inputs and not self.lagging and self._outputs is not None:
             self._last = self._last or self._packed(self._outputs)
             self.send(self._last)

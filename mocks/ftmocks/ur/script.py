@@ -28,7 +28,7 @@ LOGGED = MOVING | SETTING
 """Commands that are logged, because they move the arm or change a setting."""
 
 Steps = Generator[None, None, None]
-"""A thread of a program. Each `next()` is one control cycle."""
+"""A running thread of the control script; each `next()` runs it for one control cycle."""
 
 
 class ControlScript(ControllerProgram):
@@ -95,7 +95,7 @@ class ControlScript(ControllerProgram):
         for thread in [("main", self._main), *self._threads.items()]:
             name, steps = thread
             if name != "main" and self._threads.get(name) is not steps:
-                continue  # the thread was killed in this cycle
+                continue  # another thread has killed this one in this cycle
             try:
                 next(steps)
             except StopIteration:
@@ -142,7 +142,7 @@ class ControlScript(ControllerProgram):
             yield from steps
 
     def _accept(self) -> None:
-        """Ignore a setting that is not modelled."""
+        """Accept a command whose setting is not modelled; do nothing."""
 
     def _read_int(self, index: int) -> int:
         return self._robot.input_int(index + self._int_offset)
@@ -170,7 +170,7 @@ class ControlScript(ControllerProgram):
         self._write_vector(pose_of(X))
 
     def _report_async(self, progress: int) -> None:
-        """Return output register 2: operation id, change counter, running bit and progress (-1: end, 0: new start)."""
+        """Write output register 2: operation id, change counter, running bit and progress (-1: end, 0: new start)."""
         self._writes = (self._writes + 1) % 128
         if progress == 0:
             self._operation = (self._operation + 1) % 128
@@ -269,7 +269,7 @@ class ControlScript(ControllerProgram):
     def _set_payload(self) -> None:
         self._robot.payload_kg = self._read(0)
         cog = (self._read(1), self._read(2), self._read(3))
-        if any(cog):  # the script keeps the old centre if all values are zero
+        if any(cog):  # like ur_rtde's script, keeps the old centre for zeros
             self._robot.payload_cog_m = cog
 
     def _set_target_payload(self) -> None:

@@ -65,7 +65,7 @@ class UrServer:
         self.streaming = True
         """If false, RTDE clients are answered, but receive no samples."""
         self.ports = {**PORTS, **_ports_of(robot.settings.polyscope)}
-        """Kind of client by port."""
+        """Kind of client (a key of `CLIENTS`, or "rtde") that each TCP port serves."""
         self._silent: set[str] = set()
         self._cycle_real_ns = robot.clock.real_ns()
         self._selector = selector
@@ -116,7 +116,7 @@ class UrServer:
             client.send(client.greeting())
 
     def _forget(self, client: Client) -> None:
-        """Remove a client whose connection has ended."""
+        """Remove a client whose connection has ended from clients and selector."""
         if client in self._selector.get_map():
             self._selector.unregister(client)
         self._clients.remove(client)
@@ -206,12 +206,12 @@ class UrServer:
                 client.sample()
 
     def _deliver(self, now_s: float) -> list[float]:
-        """Send the due samples; return the time until the next one, s."""
+        """Send the RTDE samples that are due; return the times until the next sample of each client, s."""
         waits_s = [client.deliver(now_s) for client in self._rtde_clients]
         return [wait_s for wait_s in waits_s if wait_s is not None]
 
     def _keep_alive(self) -> None:
-        """Repeat the last samples while the clock is held."""
+        """Send the last RTDE samples again while the cell's clock is held, so that clients keep their connections."""
         real_ns = self.robot.clock.real_ns()
         if self.streaming and real_ns - self._cycle_real_ns >= KEEP_ALIVE_NS:
             self._cycle_real_ns = real_ns

@@ -103,7 +103,7 @@ class Device(ABC, Generic[Frame]):
         return self._pacer.running
 
     def sample_times_s(self, count: int) -> Array:
-        """Return the measuring times (count,) of the next readings, on the cell's clock."""
+        """Return the times (count,), on the cell's clock, at which the next `count` readings are to be measured."""
         return self._pacer.times_s(count)
 
     @abstractmethod
@@ -151,7 +151,7 @@ class Device(ABC, Generic[Frame]):
         """Read and process the bytes that the client has sent."""
 
     def _work(self, _now_s: float) -> float | None:
-        """Do other due tasks; return the time until the next one, s."""
+        """Do the tasks of a subclass that are due, other than the stream; return the time until the next one, s."""
         return None
 
     @abstractmethod
@@ -164,16 +164,16 @@ class Device(ABC, Generic[Frame]):
 
     @property
     def _readable(self) -> list[int]:
-        """Files on which the client may send."""
+        """Files or sockets from which bytes of the client can be read."""
         return [self._file]
 
     @property
     def _unfinished(self) -> bool:
-        """Whether bytes are waiting until the client reads."""
+        """Whether a record was sent in part, because the client does not read."""
         return False
 
     def _finish_record(self) -> None:
-        """Send the waiting bytes."""
+        """Send the rest of a record that was sent in part."""
 
     @abstractmethod
     def _close(self) -> None:
@@ -223,7 +223,7 @@ class Device(ABC, Generic[Frame]):
         return True
 
     def _tick(self, now_s: float) -> float | None:
-        """Do due tasks; return the time until the next call, s, or None if only the client can cause one."""
+        """Do the tasks that are due; return the time until the next one, s; None if only the client can cause one."""
         waits_s = [self._work(now_s)]
         if count := self._pacer.due(now_s):
             self._sample(count)

@@ -53,7 +53,7 @@ class Faults:
 
     @property
     def harm_frames(self) -> bool:
-        """Whether faults act on single frames. Otherwise many frames may be sent as one."""
+        """Whether a fault that acts on single frames is possible. If not, many frames may be sent as one."""
         return any((self.drop, self.duplicate, self.corrupt, self.byte_slip, self.swap, self.foreign, self.jitter_s))
 
 
@@ -75,7 +75,7 @@ class FaultyWire(Generic[Frame]):
         self._clock = clock
         self._random = random.Random(seed)
         self.foreign: Callable[[random.Random], Frame] | None = None
-        """Function that returns a frame of another node on the bus."""
+        """Function that returns a frame of another node on the CAN bus, for the fault `foreign`."""
         self._outbox: deque[tuple[float, Frame]] = deque()
         self._held: list[Frame] = []
 

@@ -33,7 +33,7 @@ class PtyDevice(Device[Frame]):
     `dropped_frames` counts the frames for which the terminal had no room, because the client does not read.
     """
 
-    has_parity = False  # whether the line has parity, so wrong parity can be marked
+    has_parity = False  # whether the line has parity, so that wrong parity can occur
     sees_openings = False  # whether the device can use `_is_open`, which is then correct within 5 ms
 
     def __post_init__(self) -> None:
@@ -41,7 +41,7 @@ class PtyDevice(Device[Frame]):
         self.dropped_frames = 0
         self._slave = -1
         self._unsent = b""
-        self._begun = b""  # the rest of a mark that was sent in part
+        self._begun = b""  # rest of a parity mark of which the terminal took only a part
 
     def start(self) -> str:
         """Power the device up behind a new pseudo-terminal.
@@ -53,7 +53,7 @@ class PtyDevice(Device[Frame]):
         self._require_stopped()
         self._file, self._slave = os.openpty()
         tty.setraw(self._file)
-        tty.setraw(self._slave)  # otherwise the terminal echoes the device's own bytes
+        tty.setraw(self._slave)  # else the terminal echoes what the device sends
         os.set_blocking(self._file, False)
         self._unsent = self._begun = b""
         path = os.ttyname(self._slave)
@@ -165,7 +165,7 @@ class PtyDevice(Device[Frame]):
 
     def _client_wants_marks(self) -> bool:
         """Whether wrong parity must be marked. After True is returned, the kernel no longer marks anything."""
-        attributes = termios.tcgetattr(self._file)  # those of the client, because both ends have the same
+        attributes = termios.tcgetattr(self._file)  # the flags of the client: both ends share them
         flags = attributes[0]
         if flags & (termios.INPCK | termios.IGNPAR) != termios.INPCK:
             return False

@@ -402,7 +402,7 @@ def set_gravity(program: Caller, d: Value) -> None:
 
 
 def zero_ftsensor(program: Caller) -> None:
-    """Use the current wrench as zero."""
+    """Zero the force/torque sensor: subtract its current reading from later ones."""
     program.robot.zero_ft()
 
 

@@ -55,14 +55,14 @@ _RESERVED |= {"or", "xor", "not", "True", "False", "switch", "case", "assert", "
 
 @dataclass
 class _Names:
-    """The variables of one function: its own, those it reads or assigns without a qualifier, and those with a value."""
+    """Variables of one function: its own, those used without ``local`` or ``global``, and those assigned so far."""
 
     own: set[str] = field(default_factory=set)
     free: list[tuple[str, Place]] = field(default_factory=list)
     valued: set[str] = field(default_factory=set)
     loops: int = 0
     blocks: int = 0
-    """Numbers of loops, and of blocks of any kind, around the current statement."""
+    """`loops` and `blocks` count the loops, and the blocks of any kind, around the current statement."""
 
 
 def parse(text: str, name: str, built_in: Collection[str]) -> tuple[Function, list[str]]:
@@ -122,7 +122,7 @@ class _Parser:
             self._take()
 
     def _fail(self, what: str) -> NoReturn:
-        """Raise the error at the next word, which may be in a later line."""
+        """Raise a syntax error at the position of the next word, which may be in a later line."""
         found = "the end of the line" if self._next.kind == "newline" else repr(self._next.text)
         self._skip_newlines()
         raise syntax_error(self._text, self._next.place, f"{what}, found {found}")

@@ -75,7 +75,7 @@ class Program(ControllerProgram):
         self._globals: dict[str, Value] = {}
         main, self.doubts = parse(text, name, self._built_in)
         self._returned: dict[int, Value] = {}
-        """A value that each function, by identity, has returned."""
+        """For each function, by identity, a value that it has returned: later ones must have the same type."""
         self._main = Thread("main")
         self._main.steps = self._body(Scope(self._main, main, None, self._globals))
         self._threads = [self._main]
@@ -83,7 +83,7 @@ class Program(ControllerProgram):
         self._current = self._main
         self._left = 0
         self._checked: set[int] = set()
-        """Calls, by identity, whose arguments fit the function."""
+        """Identities of the calls whose arguments were checked and fit the function."""
 
     @property
     def owner(self) -> str:
@@ -96,7 +96,7 @@ class Program(ControllerProgram):
         return self._current.place
 
     def begin_cycle(self) -> None:
-        """Let the running thread compute as much as in a new cycle."""
+        """Give the running thread a full allowance of statements again, as at the start of a cycle."""
         self._left = STATEMENTS_PER_CYCLE
 
     def step(self) -> bool:
@@ -200,7 +200,7 @@ class Program(ControllerProgram):
             raise ScriptError(f"{name} = a function without a value")
         if statement.index is not None:
             whole, index = self._variable(scope, name), (yield from self._value(scope, statement.index))
-            element(whole, index)  # the element must exist
+            element(whole, index)  # raises if the element does not exist
             whole[index] = single(value)
             return
         is_global = statement.scope == "global" or (

@@ -8,7 +8,7 @@ from ftmocks.ur.urscript.syntax import Function
 from ftmocks.ur.urscript.values import Value
 
 Run = Generator[None, None, Value]
-"""A running computation; each `next()` is one control cycle."""
+"""A running computation of a program; each `next()` runs it for one control cycle."""
 
 
 class Halt(Exception):
@@ -60,7 +60,7 @@ class Scope:
     variables: dict[str, Value]
 
     def find(self, name: str) -> "tuple[Function, Scope] | None":
-        """Find a function and the scope in which it is defined."""
+        """Return the function with this name, and the scope in which it is defined."""
         if name in self.function.functions:
             return self.function.functions[name], self
         return self.outer.find(name) if self.outer else None
