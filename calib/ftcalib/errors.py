@@ -109,11 +109,11 @@ class TooFewSamples(AcceptanceError):
 
 
 class BadDataset(DataError):
-    """The data are invalid."""
+    """The data of a file or an argument are invalid."""
 
 
 class BadCalibration(DataError):
-    """A stored calibration cannot be read."""
+    """A stored calibration cannot be read by this version."""
 
 
 class NotObservable(AcceptanceError):

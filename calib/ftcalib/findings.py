@@ -32,14 +32,14 @@ _UNITS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """Definition of a finding code."""
+    """Definition of a finding code: severities and sentence templates."""
 
     severities: Sequence[Severity]
     """Possible severities; with several, the size of the problem decides."""
     found: str
-    """Template of the description of the problem."""
+    """Template of the sentence part that describes the problem."""
     fix: str = ""
-    """Template of the remedy."""
+    """Template of the sentence part that gives the remedy."""
 
     @property
     def values(self) -> set[str]:

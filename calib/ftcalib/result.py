@@ -241,12 +241,12 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict of the worst finding."""
+        """Verdict (good, usable or rejected) of the worst finding."""
         return verdict_of(self.findings)
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
+        """Sentences of the findings: the reasons for the verdict."""
         return tuple(finding.words for finding in self.findings)
 
     @property

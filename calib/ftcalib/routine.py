@@ -45,7 +45,7 @@ class WrenchSamples(Protocol):
 
     @property
     def status(self) -> NDArray[np.uint32]:
-        """(n,) status words of the vendor."""
+        """(n,) status words of the device, with the bits of its vendor."""
 
 
 class Sensor(Protocol):
@@ -55,7 +55,7 @@ class Sensor(Protocol):
         """Return all samples of the next `duration_s` seconds; raise if the stream fails."""
 
     def check(self) -> None:
-        """Raise if the stream has failed."""
+        """Raise an error if the stream has failed; else return at once."""
 
 
 class ArmReading(Protocol):
@@ -95,7 +95,7 @@ LONGER = (1, 2, 4)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TourPose:
-    """One stop of a tour."""
+    """Planned pose at one stop of a tour."""
 
     number: int
     """Orientation number: 1 to 24 as in Yu et al., Fig. 3; above 100 for all others."""

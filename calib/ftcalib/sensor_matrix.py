@@ -318,7 +318,7 @@ class SensorMatrix(Displayed):
     """
 
     error: Array
-    """(6, 6) error matrix E in the sensor frame, N and N·m."""
+    """(6, 6) error matrix E in the sensor frame, N and N·m: reading = (I + E) wrench + bias."""
     covariance: Array
     """(39, 39) covariance of a rotation of the sensor (3, rad, flange axes) and of the entries of E, row by row."""
     source: Source = "assumed"
@@ -504,7 +504,7 @@ class ContactResponse:
     parameters: Parameters
     """Parameters of the tool."""
     error: Array
-    """(6, 6) estimated error matrix E."""
+    """(6, 6) estimated error matrix E of the sensor: reading = (I + E) wrench."""
     error_covariance: Array
     """(39, 39) covariance of the mounting (3, rad, sensor axes) and of the entries of E, row by row."""
 
@@ -542,7 +542,7 @@ class ContactResponse:
     @cached_property
     def _by_products(self) -> Array:
         """(36, 36) matrix that maps the products w w' of a contact w to its covariance, both row by row."""
-        columns = self.error_columns(np.eye(6))  # (wrench, axis, error)
+        columns = self.error_columns(np.eye(6))  # axes: wrench, axis of the decoded contact, error
         C = np.einsum("kia,ab,ljb->ijkl", columns, self.error_covariance, columns)
         F = ranges(self.sensor.lever_m)
         C += self.sensor.floor**2 * np.einsum("ij,kl->ijkl", np.diag(F**2), np.diag(F**-2.0))

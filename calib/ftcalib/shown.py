@@ -41,7 +41,7 @@ class ShownEstimate(NamedTuple):
     factor: float
     """Conversion factor from SI to the displayed unit."""
     unit: str
-    """Displayed unit."""
+    """Unit in which the quantity is displayed."""
     key: str
     """Name of the quantity in a calibration file, such as "mass_kg"."""
     values: Array

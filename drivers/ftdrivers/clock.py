@@ -36,7 +36,7 @@ class Clock(ABC):
     lead_s = 0.0
     """Largest lag of a device behind this clock, s: an emulator in another process may get no CPU time."""
     can_be_held = False
-    """Whether time stops during a `held` block."""
+    """Whether the time of this clock stops during a `held` block."""
 
     def patience_s(self, limit_s: float) -> float:
         """Return a time-out for another process, s of real time. It is long in an emulated cell."""
@@ -47,7 +47,7 @@ class Clock(ABC):
         """Return the time in nanoseconds; samples are stamped with it as `t_host_ns`."""
 
     def now_s(self) -> float:
-        """Return the same time in seconds."""
+        """Return the time of this clock, that of `now_ns`, in seconds."""
         return self.now_ns() / 1e9
 
     def awake_s(self) -> float:

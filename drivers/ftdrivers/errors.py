@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 UNUSABLE: Final = "discard its data, check load, supply and cable, then power it off and on"
-"""The fix for a critical status."""
+"""Text that says what to do about a critical status of a sensor."""
 
 
 class ConnectError(DeviceError):
@@ -65,11 +65,11 @@ class NoDashboard(ConnectError):
 
 
 class StreamBroken(DeviceError):
-    """An established connection was lost."""
+    """An established connection to a device was lost."""
 
 
 class DeviceTimeout(DeviceError):
-    """No data arrived within a time-out."""
+    """A device sent no data or no answer within a time-out."""
 
 
 class ProtocolError(DeviceError):

@@ -99,7 +99,7 @@ class Columns:
         )
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Self:
-        """Return a block with the selected rows."""
+        """Return a block that contains only the selected rows."""
         return type(self)(
             *(getattr(self, name) if name in self._COMMON else getattr(self, name)[which] for name in self._names())
         )
@@ -135,7 +135,7 @@ class FtSamples(Columns):
     wrench: Array
     """(n, 6) force in N, then torque in N·m."""
     status: NDArray[np.uint32]
-    """(n,) the vendor's status word."""
+    """(n,) status word of the device, with the bits of its vendor."""
 
     @classmethod
     def of(
@@ -236,7 +236,7 @@ class ArmStates(Columns):
 
     @classmethod
     def of(cls, states: Sequence[ArmState]) -> Self:
-        """Build samples from one state or more."""
+        """Build a block of samples from one or more single states."""
         return cls(*(np.array([getattr(state, name) for state in states]) for name in cls._names()))
 
 
@@ -364,7 +364,7 @@ class ForceTorqueSensor(_Device):
 
     @abstractmethod
     def health(self) -> Health:
-        """Return the statistics since `open`."""
+        """Return the statistics of the stream since `open`."""
 
     def temperature_C(self) -> float | None:
         """Return the temperature that came with the newest sample, °C; None if the sensor reports none."""

@@ -52,7 +52,7 @@ class Options:
             raise BadUrl(f"{url}: an option is given twice; remove one")
 
     def text(self, key: str, default: str) -> str:
-        """Return an option as text."""
+        """Return the value of an option of the address as text."""
         self._asked.add(key)
         value = self._given.get(key, default)
         if not value:
@@ -137,7 +137,7 @@ class _UrlParts:
     address: str
     """Port, bus or host of the device, percent-decoded."""
     query: str
-    """The options, still encoded."""
+    """The options after the question mark, still percent-encoded."""
     fragment: str
 
 

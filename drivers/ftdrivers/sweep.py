@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 WRISTS: Final = (3, 4, 5)
 """Indices of the joints that move, counted from 0."""
 WAVES: Final = 2
-"""Number of sines per joint."""
+"""Number of sines that are added for each wrist joint."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +70,7 @@ class Sweep:
         amplitude, frequency, phase = np.moveaxis(self.waves, -1, 0)
         angle = t[:, None, None] * frequency + phase
         q = np.zeros((len(t), 6))
-        for k, binomial in enumerate(_binomials(derivative)):  # Leibniz: k derivatives of the window
+        for k, binomial in enumerate(_binomials(derivative)):  # product rule of Leibniz: k derivatives of the window
             window = _window(x, k) * (side / self.ramp_s) ** k
             order = derivative - k
             sines = (amplitude * frequency**order * np.sin(angle + order * np.pi / 2)).sum(axis=2)

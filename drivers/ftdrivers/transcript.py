@@ -82,7 +82,7 @@ class Writer:
         self._line({"format": FORMAT, **header})
 
     def event(self, name: str, **content: Any) -> None:
-        """Record an event."""
+        """Write an event, such as "open", to the transcript."""
         self.has_port |= name == "open"
         self._entry(event=name, **content)
 
@@ -165,7 +165,7 @@ class Writer:
 
 @dataclass(frozen=True, slots=True)
 class Passage:
-    """Bytes that were sent in one direction."""
+    """Bytes of a transcript that were sent together in one direction."""
 
     t_ns: int
     sent: bool

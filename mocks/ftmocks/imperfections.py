@@ -158,7 +158,7 @@ class Ringing(NamedTuple):
 
     @classmethod
     def at_rest(cls, settings: Imperfections, seed: int) -> "Ringing":
-        """Return the state of links at rest."""
+        """Return the state of links that do not ring."""
         hertz = np.random.default_rng([seed, 8]).uniform(*RING_HZ, 6)
         rates = np.empty(6, np.complex128)
         rates.real, rates.imag = -1.0 / RING_DECAY_S, 2 * np.pi * hertz

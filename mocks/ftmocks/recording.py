@@ -136,7 +136,7 @@ class RecordedWorld(World):
         self.recording = recording
 
     def load_wrench(self, t_s: float | None = None) -> Array:
-        """Return the recorded wrench (6,)."""
+        """Return the recorded wrench (6,) at a time of the cell's clock, by default now."""
         wrench: Array = self.recording.wrench(np.array([self.now_s if t_s is None else t_s]))[0]
         return wrench
 

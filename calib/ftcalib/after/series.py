@@ -25,7 +25,7 @@ class EstimatedParameters(Protocol):
 
     @property
     def parameters(self) -> Parameters:
-        """Estimated parameters."""
+        """Estimated parameters of sensor and tool."""
 
     @property
     def covariance(self) -> Array:
@@ -34,7 +34,7 @@ class EstimatedParameters(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ChiSquare:
-    """Chi-square test of no difference."""
+    """Chi-square test of the hypothesis that two calibrations do not differ."""
 
     chi2: float
     """Squared Mahalanobis distance; infinite if exactly known values differ."""
@@ -247,10 +247,10 @@ FEWEST_ESTIMATES = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trend:
-    """Weighted straight line through n estimates of k numbers."""
+    """Weighted straight line over time through n estimates of k numbers, and the test of its slope."""
 
     slope: Array
-    """(k,) change per unit of time."""
+    """(k,) change of the estimated numbers per unit of `t`."""
     sigma: Array
     """(k,) standard deviation of the slope, from the covariances or from the scatter, whichever is larger."""
     p_value: float

@@ -115,7 +115,7 @@ class Expected:
         return np.asarray(K @ self.calibration.joint_covariance @ K.T)
 
     def p_value(self, chi2: float, dof: int) -> float:
-        """Return the probability of a larger chi2."""
+        """Return the probability of a larger `chi2` if the cell has not changed."""
         chi2 /= self.factor
         return float(chi2_sf(dof, chi2) if np.isinf(self.freedom) else f_sf(dof, self.freedom, chi2 / dof))
 
@@ -283,7 +283,7 @@ class Verification:
     predicted_sigma: Array
     """(n, 6) standard deviation of the residuals from noise, drift and uncertainty of the calibration, N and N·m."""
     chi2: float
-    """Joint chi2 of all residuals."""
+    """Joint chi2 of all residuals: their squared Mahalanobis distance from the prediction."""
     dof: int
     p_value: float
     """Probability of a larger chi2 if nothing has changed."""

@@ -75,7 +75,7 @@ class Weight(Displayed):
     least_kg: float
     """Smallest mass that this weighing could have distinguished from zero, kg."""
     p_sensor_com_m: Array
-    """(3,) centre of mass; meaningless unless `is_something`."""
+    """(3,) centre of mass in the sensor frame, m; meaningless unless `is_something` is true."""
     com_covariance: Array
     """(3, 3) covariance of the centre of mass, m²."""
     line: Array | None
@@ -107,7 +107,7 @@ class Weight(Displayed):
 
     @property
     def is_something(self) -> bool:
-        """Whether the mass differs significantly from zero."""
+        """Whether a part was held: the measured mass differs significantly from zero."""
         return self.mass_kg > self.least_kg
 
     @property
@@ -229,13 +229,13 @@ class _LoadFit:
     """(4,) mass and mass times centre of mass, kg and kg·m."""
     covariance: Array
     S: Array
-    """(6n, 6n) covariance of the readings."""
+    """(6n, 6n) covariance of the readings of all n poses."""
     H: Array
     """(6n, 4) derivative of the readings with respect to `x`."""
     near: Array
     """(3, 4) prior of the centre of mass, in standard deviations."""
     misfit: Array
-    """(6n,) residuals of the readings."""
+    """(6n,) residuals of the readings after the fit."""
 
     @property
     def sigma_kg(self) -> float:

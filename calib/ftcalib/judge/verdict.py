@@ -107,7 +107,7 @@ class Case:
     t_s: Array | None = None
     """(n,) times of the poses; the order of rows is used if times are missing or not finite."""
     setup: Setup = NOTHING
-    """Description of the cell."""
+    """Description of the cell, with which the estimates are compared."""
     known: Known | None = None
     """Known values used by the estimates."""
     free: Estimate | None = None
@@ -127,7 +127,7 @@ class Quality:
     """Judgement of estimates: statistics, findings and verdict."""
 
     used: NDArray[np.bool_]
-    """(n,) whether a pose was used."""
+    """(n,) whether each pose was used in the fit; the others were rejected."""
     finest: Array
     """(6,) smallest residual that a sensor, or readings that were written rounded, can resolve."""
     is_exact: bool
@@ -143,7 +143,7 @@ class Quality:
     lag1: float
     """Correlation of the residuals of successive used poses; near 0 without drift."""
     lag1_p: float
-    """Probability of a larger correlation by chance."""
+    """p-value of `lag1`: probability of a larger correlation by chance."""
     largest_share: float
     """Largest error of force or torque relative to the weight."""
     errors: list[Finding]
@@ -169,7 +169,7 @@ class Quality:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict of the worst finding."""
+        """Verdict (good, usable or rejected) of the worst finding."""
         return verdict_of(self.findings)
 
     @property

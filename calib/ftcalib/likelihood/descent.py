@@ -70,9 +70,9 @@ class Statistics:
     reference: Array
     """(6, 10) value of Theta close to the solution, so that no digits are lost."""
     A: Array
-    """(60, 60) quadratic coefficients."""
+    """(60, 60) quadratic coefficients of the cost in D."""
     B: Array
-    """(60,) linear coefficients."""
+    """(60,) linear coefficients of the cost in D."""
     square: float
 
     @classmethod
@@ -154,7 +154,7 @@ SAME_ROTATION_RAD = np.deg2rad(1.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum:
-    """Local minimum of the joint cost."""
+    """Local minimum of the joint cost of forces and torques."""
 
     parameters: Parameters
     chi2: float
@@ -162,7 +162,7 @@ class Minimum:
     information: Array
     """(15, 15) Fisher information at the minimum, including priors."""
     settled: bool = True
-    """Whether the descent converged."""
+    """Whether the descent to this minimum converged."""
 
 
 class Descent:
@@ -214,7 +214,7 @@ class Descent:
 
     @staticmethod
     def distinct(ends: list[Minimum]) -> list[Minimum]:
-        """Return the distinct minima by ascending chi2."""
+        """Return the minima by ascending chi2, without duplicates."""
         minima: list[Minimum] = []
         for end in sorted(ends, key=lambda end: end.chi2):
             if not any(Descent.same(end.parameters, other.parameters) for other in minima):

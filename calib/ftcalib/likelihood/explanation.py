@@ -307,7 +307,7 @@ class Explanation:
     noticed: bool = False
     """Whether the kept poses may still contain outliers, so that the search should also start from a robust fit."""
     noise: Noise | None = None
-    """Noise model at `parameters`."""
+    """Noise model of this explanation, evaluated at `parameters`."""
 
     @property
     def noise_moves(self) -> bool:

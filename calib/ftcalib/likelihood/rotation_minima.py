@@ -26,7 +26,7 @@ class RotationMinimum:
     """Local minimum of the cost over the rotations."""
 
     R: Array
-    """(3, 3) rotation, flange to sensor."""
+    """(3, 3) rotation that maps flange to sensor coordinates."""
     cost: float
     """`r.T @ Q @ r`."""
 

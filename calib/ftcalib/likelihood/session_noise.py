@@ -120,12 +120,12 @@ class Noise:
         self._logdet += float(np.linalg.slogdet(core)[1]) + float(np.log(variance[np.isfinite(variance)]).sum())
 
     def _solve_walk(self, X: Array) -> Array:
-        """Return M^-1 X for X (n, k, m)."""
+        """Return M^-1 X for X (n, k, m), with the banded matrix M that `_add_walk` has factorised."""
         Z = dpbtrs(self._cholesky, X.reshape(-1, X.shape[2]))[0]
         return np.asarray(Z.reshape(X.shape))
 
     def solve(self, X: Array) -> Array:
-        """Return V^-1 X for X (n, 6, m)."""
+        """Return V^-1 X for X (n, 6, m), with V the covariance of all wrenches."""
         Y = np.asarray(self.W @ X)
         if self._walking.size:
             s = self._s[:, None]
@@ -136,14 +136,14 @@ class Noise:
 
     @cached_property
     def logdet(self) -> float:
-        """Log-determinant of V; infinite variances are left out."""
+        """Log-determinant of the covariance V of all wrenches; infinite variances are left out."""
         common = self.D.strides[0] == 0
         each = np.broadcast_to(np.linalg.slogdet(self.D[:1] if common else self.D)[1], self.n)
         return self._logdet + float(each[self.kept].sum())
 
     @cached_property
     def blocks(self) -> Array:
-        """(n, 6, 6) diagonal blocks of V^-1."""
+        """(n, 6, 6) diagonal blocks of V^-1, with V the covariance of all wrenches."""
         W = self.W
         if self._walking.size:
             WS = self.W[:, :, self._walking] * self._s

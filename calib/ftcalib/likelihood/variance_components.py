@@ -102,7 +102,7 @@ STRUCTURE = (
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Estimation problem, linearised at given parameters."""
+    """Estimation problem of one session, linearised at given parameters, without the variances."""
 
     J: Array
     """(n, 6, m) derivative of the wrench with respect to the free parameters."""
@@ -153,7 +153,7 @@ class Linearised:
 
     @cached_property
     def places(self) -> Mapping[str, NDArray[np.intp]]:
-        """Column indices of `X`, by effect."""
+        """Column indices of `X` by the name of the effect."""
         first = self.J.shape[2] + 6
         ends = first + np.cumsum([0, *(columns.shape[2] for columns in self.effects.values())])
         return {kind: np.arange(ends[k], ends[k + 1]) for k, kind in enumerate(self.effects)}
@@ -202,7 +202,7 @@ class Point:
     WX: Array
     """(n, 6, M) inverse of the covariance `own` times `Linearised.X`."""
     G: Array
-    """(M, M) X' W X."""
+    """(M, M) products X' W X with the inverse covariance W of `own`."""
     unknown: NDArray[np.intp]
     """(k,) indices of the columns of X whose coefficients are estimated."""
     C: Array
@@ -211,7 +211,7 @@ class Point:
     """(k,) estimated coefficients, relative to the point of linearisation."""
     chi2: float
     loglik: float
-    """Restricted log-likelihood, up to a constant."""
+    """Restricted log-likelihood of the variances, up to a constant."""
 
     @property
     def worth(self) -> float:
@@ -225,7 +225,7 @@ class Point:
 
     @property
     def step(self) -> Array:
-        """(m,) step of the free parameters."""
+        """(m,) estimated step of the free parameters."""
         return self.x[: self.problem.J.shape[2]]
 
     @property
@@ -236,7 +236,7 @@ class Point:
 
     @property
     def noise(self) -> Noise:
-        """Covariance of all components together."""
+        """Covariance of the wrenches due to measured noise and all components together."""
         return noise_of(self.problem, self.components, self.theta)
 
     def weigh_columns(self) -> tuple[Array, Array]:

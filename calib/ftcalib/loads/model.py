@@ -115,7 +115,7 @@ class Linear:
     J: list[Array]
     """(6n, k) derivatives of the readings with respect to all unknowns."""
     residual: list[Array]
-    """(6n,) readings minus model."""
+    """(6n,) residuals: readings minus those of the model."""
     noise: list[Mapping[str, Array]]
     """(6n, 6n) covariances of the disturbances for standard deviation 1, by their name in `SIZES`."""
     readout: list[Array]
@@ -133,7 +133,7 @@ class Evaluated:
     gradient: Array
     """Derivative of the cost with respect to the logarithms of the sizes."""
     step: Array
-    """(k,) step of all unknowns."""
+    """(k,) Gauss-Newton step of all unknowns."""
     covariance: Array
     """(k, k) covariance of all unknowns."""
     unexplained: list[tuple[Array, Array]]
@@ -220,7 +220,7 @@ class LoadModel:
 
     @property
     def error(self) -> Array:
-        """(6, 6) error matrix E."""
+        """(6, 6) error matrix E of the sensor: reading = (I + E) wrench."""
         return self.x[self.at["matrix"]].reshape(6, 6)
 
     def linear(self) -> Linear:
@@ -269,7 +269,7 @@ class LoadModel:
 
     @property
     def tool_is_weighed(self) -> bool:
-        """Whether the tool was weighed."""
+        """Whether the weighed mass of the tool is known to the model."""
         return bool(self.information[self.at["tool"].start, self.at["tool"].start] > _ANY_KG**-2.0)
 
     def load_of(self, run: int) -> int:

@@ -54,7 +54,7 @@ class MovingLoad:
     delay_s: float = 0.0
     """Delay of the wrench in addition to the delay assumed in the rows, s."""
     response: Array = field(default_factory=lambda: np.zeros(11))
-    """(11,) coefficients of gain and cross-talk."""
+    """(11,) coefficients of the sensor's gain and cross-talk."""
 
     def moved(self, step: Array) -> Self:
         """Return the load after an error vector (34,): 15 as in `Parameters.moved`, then `NAMES`, then the response."""
@@ -109,7 +109,7 @@ class PoseError:
         return Motion(motion.R_base_flange, acceleration, Omega)
 
     def corrected(self, rows: MotionRows) -> MotionRows:
-        """Return the rows with the error removed."""
+        """Return the rows of a motion with the error of the poses removed."""
         return replace(rows, motion=self.undone(rows.motion), rate=self.undone(rows.rate))
 
     @staticmethod

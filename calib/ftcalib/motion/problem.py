@@ -424,7 +424,7 @@ class Solution:
 
     @property
     def covariance(self) -> Array:
-        """Covariance of load and effects."""
+        """Covariance of all unknowns: coordinates of the load and random effects."""
         return np.asarray(self.basis @ cho_solve(self.factor, self.basis.T))
 
 

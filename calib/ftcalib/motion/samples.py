@@ -321,7 +321,7 @@ class MotionRows:
 
     t_s: Array
     wrench: Array
-    """(n, 6) N and N·m."""
+    """(n, 6) filtered wrench in the sensor frame, N and N·m."""
     motion: Motion
     rate: Motion
     """Rate of change of the motion, per second."""

@@ -55,7 +55,7 @@ class ForceEquations:
 
     @property
     def D(self) -> Array:
-        """(3n, 3) matrix D of eq. 17."""
+        """(3n, 3) matrix D of Carlson's eq. 17: the stacked orientations."""
         return self.A.reshape(-1, 3)
 
     @property

@@ -105,7 +105,7 @@ def decode_text(data: bytes) -> str:
 
 
 def decode_serial(data: bytes) -> str:
-    """Decode the serial number."""
+    """Decode the serial number in a reply of the sensor."""
     _expect(data, 8, "serial number")
     return decode_text(data)
 
@@ -130,7 +130,7 @@ def decode_unit_codes(data: bytes) -> tuple[int, int]:
 
 
 def decode_firmware(data: bytes) -> Firmware:
-    """Decode the firmware version."""
+    """Decode the firmware version in a reply of the sensor."""
     return Firmware(*_unpack(">BBH", data, "firmware version"))
 
 

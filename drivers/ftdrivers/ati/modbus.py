@@ -124,12 +124,12 @@ def decode_calibration_block(data: bytes) -> _CalibrationBlock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Records:
-    """n decoded stream records."""
+    """n decoded records of the stream: gauges, checks and error bits."""
 
     gauges: NDArray[np.int32]
     """(n, 6) gauge counts in natural order G0..G5."""
     intact: NDArray[np.bool_]
-    """(n,) whether the checksum is correct."""
+    """(n,) whether the checksum of a record is correct."""
     parity: NDArray[np.bool_]
     """(n,) whether the parity of all bytes is correct. Bad parity proves no slip: some adapters mark whole packets."""
     error: NDArray[np.bool_]
@@ -137,7 +137,7 @@ class Records:
 
 
 _RECORD = np.dtype([("gauges", ">i2", 6), ("last", "u1")])
-# A record has the gauges in the order G0 G2 G4 G1 G3 G5.
+# Indices that restore the natural order of the gauges; a record has the order G0 G2 G4 G1 G3 G5.
 _NATURAL_ORDER = np.array([0, 3, 1, 4, 2, 5])
 
 

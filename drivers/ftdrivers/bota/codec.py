@@ -41,7 +41,7 @@ class Identity(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """One sample."""
+    """One decoded sample of the sensor."""
 
     status: int
     wrench: tuple[float, ...]
@@ -64,7 +64,7 @@ def deframer() -> Deframer:
 
 
 def decode_frame(data: bytes) -> Frame:
-    """Decode a complete frame."""
+    """Decode a complete stream frame."""
     if not is_frame(data):
         raise ProtocolError(f"the bytes {data.hex(' ')} are not a frame")
     status, *wrench, t_us, temperature_C = _PAYLOAD.unpack_from(data, 1)

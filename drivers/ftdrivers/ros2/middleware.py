@@ -79,7 +79,7 @@ class Node:
         self._failure: Exception | None = None
 
     def spin(self) -> None:
-        """Start calling the callbacks."""
+        """Start the thread that calls the callbacks of the subscriptions."""
         self._thread = Thread(target=self._spin, name=f"ROS 2 of {self.node.get_name()}", daemon=True)
         self._thread.start()
 
@@ -91,7 +91,7 @@ class Node:
         try:
             self._executor.spin()
         except (self._executors.ExternalShutdownException, self._executors.ShutdownException):
-            pass  # the node was closed meanwhile
+            pass  # another thread has closed the node meanwhile
         except Exception as error:
             self._failure = error
 
@@ -101,7 +101,7 @@ class Node:
             raise self._failure
 
     def close(self) -> None:
-        """Leave the graph. Idempotent."""
+        """Stop the thread and leave the ROS graph. Idempotent."""
         if self.context.ok():
             self._executor.shutdown()
             if self._thread is not None:
@@ -124,7 +124,7 @@ _UNNUMBERED: Final = (1 << 64) - 1
 
 
 class Received(NamedTuple):
-    """A message with information about its transmission."""
+    """A received message with its sequence number and time of receipt."""
 
     message: Any
     t_host_ns: int

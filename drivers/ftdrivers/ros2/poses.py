@@ -46,7 +46,7 @@ class Chain:
     def __init__(self, path: Path, base: str, flange: str) -> None:
         try:
             with path.open("rb") as file:
-                root = ET.fromstring(file.read(_LARGEST).decode())  # the file is on the user's own disk
+                root = ET.fromstring(file.read(_LARGEST).decode())  # safe to parse: the file is on the user's own disk
         except (OSError, UnicodeDecodeError, ET.ParseError) as error:
             raise BadUrl(f"{path} is not a URDF ({error}): give the file with xacro evaluated") from error
         joints = {}
@@ -131,10 +131,10 @@ class StampedPose(NamedTuple):
 
 
 class PoseReader(Protocol):
-    """Converts messages of its topics to poses."""
+    """Converts the messages of its topics to poses of the flange in the base."""
 
     topics: dict[str, str]
-    """Message type of each topic."""
+    """Message type of each topic to which the reader needs a subscription."""
 
     def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
         """Yield the poses that a message completes. Raises `ProtocolError` for an invalid pose, joint or time stamp."""
@@ -161,7 +161,7 @@ class Poses:
         self.topics = {topic: "geometry_msgs/msg/PoseStamped"}
 
     def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
-        """Yield the pose of a message."""
+        """Yield the flange pose that a PoseStamped message contains."""
         pose = _pose_of(message.pose.position, message.pose.orientation, f"a pose of {topic}")
         yield StampedPose(stamp_ns(message.header, topic), *pose)
 

@@ -31,7 +31,7 @@ class Liveness:
         self.forget()
 
     def forget(self) -> None:
-        """Forget earlier samples."""
+        """Forget earlier samples, for example after a reconnection."""
         self._last = np.zeros(0)
         self._same_rows, self._same_since_ns = 0, 0
 
@@ -109,7 +109,7 @@ class Rate:
         self.forget()
 
     def forget(self) -> None:
-        """Restart the count with the next samples."""
+        """Restart the count of samples, from which the rate follows, with the next samples."""
         self._since_ns, self._samples = 0, 0
 
     def judge(self, samples: int, t_host_ns: int, nominal_Hz: float) -> str | None:

@@ -39,7 +39,7 @@ class StreamLimits:
     """Time-outs of a stream, in seconds of its clock. The defaults are those of a real sensor."""
 
     stale_s: float = 0.3
-    """Longest silence before the stream is stale."""
+    """Longest time without a sample after which the stream counts as stale."""
     first_sample_s: float = 1.0
     """Time-out from the last reply of the device to the first sample."""
     away_s: float = 0.3
@@ -263,7 +263,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._check()
 
     def health(self) -> Health:
-        """Return the statistics since `open`."""
+        """Return the statistics of the stream since `open`."""
         with self._news:
             now_ns = self._clock.now_ns()
             since_ns = max(now_ns - 1_000_000_000, self._opened_ns)
@@ -384,7 +384,7 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _pump(self) -> None:
         block = self._read_block()
-        turn_s = self._turn()  # after the read, because samples are stamped when they are read
+        turn_s = self._turn()  # after the read, because a read stamps its samples
         if self._was_away(turn_s):
             self._drop_backlog(turn_s, len(block))
         elif len(block):

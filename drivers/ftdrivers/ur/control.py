@@ -38,7 +38,7 @@ class Control(ABC):
     @property
     @abstractmethod
     def alive(self) -> bool:
-        """Whether the program accepts calls."""
+        """Whether the control program accepts calls."""
 
     @property
     def has_ended(self) -> bool:

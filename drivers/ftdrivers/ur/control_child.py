@@ -57,7 +57,7 @@ class _Control(Protocol):
 
 
 class Calls:
-    """The methods that the parent process calls."""
+    """Methods of this process that the parent process calls by name."""
 
     def __init__(self, control: _Control, stop_rad_s2: float) -> None:
         self._control = control
@@ -162,7 +162,7 @@ def _main() -> None:
 
 
 def serve(calls: Calls, requests: "SimpleQueue[str | None]", reply: Callable[..., None], unwatched_s: float) -> None:
-    """Answer requests until None is received."""
+    """Answer the requests of the parent process until None is received."""
     while True:
         try:
             line = requests.get(timeout=unwatched_s if calls.moving else None)

@@ -67,7 +67,7 @@ class ControlProcess(Control):
 
     @property
     def alive(self) -> bool:
-        """Whether the process accepts calls."""
+        """Whether the control process accepts calls."""
         return not (self._ended or self._killed)
 
     def wait_until_ready(self, look_out: LookOut) -> None:

@@ -104,7 +104,7 @@ class Pose:
     """Pose of a frame b in a frame a: `p_a = R @ p_b + p_m`."""
 
     R: Array
-    """(3, 3) rotation matrix."""
+    """(3, 3) rotation matrix that maps coordinates in b to a."""
     p_m: Array
     """(3,) origin of b in a, m."""
 

@@ -43,7 +43,7 @@ class OwnProgram:
         self.left_behind = self._starting = True
 
     def has_started(self) -> None:
-        """Remember that the program runs."""
+        """Remember that the control program has started to run."""
         self._starting = False
 
     def is_stopped(self) -> None:
@@ -117,7 +117,7 @@ class Opening:
 
     @property
     def path(self) -> ControlPath:
-        """The control path of this arm."""
+        """Name of the control path of this arm: "ur-rtde" or "script"."""
         return path_for(self.setting, self.reader.version)[0]
 
     def open(self) -> Control:

@@ -49,14 +49,14 @@ _RECEIVE_BYTES: Final = 65536
 
 @dataclass(frozen=True, slots=True)
 class Started:
-    """A program has started."""
+    """Message: a program has started on the controller."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class Stopped:
-    """A program has ended."""
+    """Message: a program has ended on the controller."""
 
     name: str
 

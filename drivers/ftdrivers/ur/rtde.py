@@ -58,7 +58,7 @@ _SILENT_S: Final = 1.0
 
 
 def encode(kind: int, payload: bytes = b"") -> bytes:
-    """Return the bytes of a package."""
+    """Return the bytes of an RTDE package with its header."""
     return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
 
 
@@ -240,7 +240,7 @@ class Subscription:
         self.version = (0, 0, 0, 0)
         """Version of the controller: major, minor, bugfix, build."""
         self.rate_Hz = frequency_Hz
-        """Rate at which the controller sends."""
+        """Rate at which the controller sends samples, Hz."""
         self.is_full_rate = False
         self.missing: list[str] = []
         """Outputs that this controller does not know. Samples do not have them."""

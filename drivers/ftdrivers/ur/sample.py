@@ -36,9 +36,9 @@ OUTPUTS: Final = MappingProxyType(
         "payload_cog": "VECTOR3D",
     }
 )
-"""Names and types of the subscribed outputs."""
+"""Names and types of the RTDE outputs that the reader subscribes to."""
 OPTIONAL: Final = frozenset({"tcp_offset", "payload", "payload_cog"})
-"""Outputs that older controllers do not know."""
+"""RTDE outputs that older controllers do not know."""
 
 PROGRAM_STOPPED: Final = 1
 PROGRAM_PLAYING: Final = 2
@@ -156,7 +156,7 @@ class Sample:
 
     @property
     def measures(self) -> bool:
-        """Whether the controller measures the joints."""
+        """Whether the controller measures the joints, which needs power."""
         return MEASURING[0] <= self.robot_mode <= MEASURING[1]
 
     def safety_fault(self) -> DeviceFault | None:

@@ -30,7 +30,7 @@ from ftdrivers.ur.rtde import Subscription
 from ftdrivers.ur.timing import Patience, UrTiming, held
 
 NAME: Final = "ftdrive_control"
-"""Name of the program on the controller."""
+"""Name of the control program on the controller."""
 INPUTS: Final = MappingProxyType(
     {f"input_int_register_{k}": "INT32" for k in range(32, 36)}
     | {f"input_double_register_{k}": "DOUBLE" for k in range(24, 34)}
@@ -60,7 +60,7 @@ COMMANDS: Final = MappingProxyType(
 """Codes of the commands, by the names of `control_child.Calls`, which has no sweep."""
 # A command is executed once, if its sequence number is higher than the last one. Therefore no motion can start late.
 MOVING: Final = ("move", "sweep")
-"""Commands that start a motion."""
+"""Codes of the commands that start a motion."""
 _MOVING: Final = 2
 _NO_HEARTBEAT: Final = -2
 
@@ -87,7 +87,7 @@ class _Report:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the program has ended by itself."""
+        """Whether the control program reports that it has ended by itself."""
         return self.state < 0
 
     @property
@@ -163,12 +163,12 @@ class ScriptControl(Control):
 
     @property
     def alive(self) -> bool:
-        """Whether the program accepts calls."""
+        """Whether the control program accepts calls."""
         return not self._killed and self._failure is None
 
     @property
     def has_ended(self) -> bool:
-        """Whether the program has reported its end."""
+        """Whether the control program has reported its own end."""
         return self._report.token == self._token and self._report.has_ended
 
     def wait_until_ready(self, look_out: LookOut) -> None:

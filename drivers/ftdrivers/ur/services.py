@@ -97,7 +97,7 @@ class _RobotApi:
         self._request("PUT", "/program/v1/state", {"action": "stop"})
 
     def model(self) -> str | None:
-        """Return the model, such as UR15."""
+        """Return the model that the Robot API reports, such as UR15."""
         return self._value("/system/v1/information", "robotType")
 
     def serial(self) -> str | None:
@@ -177,7 +177,7 @@ class Services(Protocol):
         """Return whether programs from the network are accepted."""
 
     def close(self) -> None:
-        """Disconnect."""
+        """Disconnect from the service."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +192,7 @@ class ServicesOf:
 
     @property
     def name(self) -> str:
-        """Name of the service for messages."""
+        """Name of the service, dashboard server or Robot API, for messages."""
         return "Robot API" if self.has_api else "dashboard server"
 
     @property

@@ -17,7 +17,7 @@ class UrTiming:
 
     # Limits on samples from the controller are equal in real and emulated cells.
     stale_s: float = 0.2
-    """Longest time without a sample."""
+    """Longest time without a sample before the controller counts as silent."""
     status_s: float = 0.05
     """Largest age of a status since its receipt."""
     late_s: float = 0.05
@@ -104,7 +104,7 @@ class Patience:
 
     @property
     def is_over(self) -> bool:
-        """Whether `limit_s` has passed."""
+        """Whether the wait has lasted `limit_s` or longer."""
         return self._left_ns <= 0
 
     def wait(self, changed: Waitable) -> None:

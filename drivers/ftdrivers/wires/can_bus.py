@@ -22,7 +22,7 @@ _DISCARD_S = 0.1
 
 
 CanFrame = tuple[int, bytes]
-"""Identifier and data."""
+"""Identifier and data of a CAN frame."""
 
 
 class CanBus:
@@ -74,7 +74,7 @@ class CanBus:
         if self._interface == "slcan":
             # python-can waits 2 s for adapters that reboot when their port is opened; an emulator does not reboot
             tty = tty.split("@", maxsplit=1)[0]
-            with contextlib.suppress(OSError):  # the link to an adapter may vanish meanwhile
+            with contextlib.suppress(OSError):  # the symbolic link to an adapter may vanish meanwhile
                 tty = os.path.realpath(tty)
             if not os.access(tty, os.R_OK | os.W_OK):
                 raise ConnectError(
@@ -128,7 +128,7 @@ class CanBus:
         try:
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=timeout_s)
         except BUS_ERRORS as exc:
-            if not isinstance(exc.__cause__, serial.SerialTimeoutException):  # a busy computer causes time-outs too
+            if not isinstance(exc.__cause__, serial.SerialTimeoutException):  # a time-out may be due to a busy computer
                 raise self._broken(exc) from exc
 
     def receive(self, timeout_s: float) -> tuple[int, bytes] | None:

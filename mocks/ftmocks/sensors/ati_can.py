@@ -21,7 +21,7 @@ from ftmocks.sensors.kind import Kind
 from ftmocks.wires.slcan import CanFrame
 from ftmocks.wires.stream import CanSensor
 
-EMPTY_SLOT_STATUS = 0x8040  # bad active calibration, any error
+EMPTY_SLOT_STATUS = 0x8040  # status bits of an empty slot: bad active calibration, any error
 NO_ARGUMENT, ONE_ARGUMENT = (0, 1), (1,)  # accepted data lengths by opcode; an additional byte is tolerated
 REQUEST_DLC = {
     0x0: NO_ARGUMENT,
@@ -111,7 +111,7 @@ class AtiCanNode(CanSensor):
             self.base, self.bitrate = self._next_base, self._next_bitrate
 
     def _samples(self, _count: int) -> list[CanFrame]:
-        return []  # this sensor only answers requests
+        return []  # no stream: this sensor only answers requests
 
     def answer(self, request: CanFrame) -> list[CanFrame]:
         """Return the frames that answer a request; none if the frame is not a request."""
@@ -158,7 +158,7 @@ class AtiCanNode(CanSensor):
         return []
 
     def _gauges(self) -> NDArray[np.int16]:
-        calibration = self.calibrations.get(self._slot, REFERENCE)  # an empty slot does not stop the converter
+        calibration = self.calibrations.get(self._slot, REFERENCE)  # the converter runs on, even with an empty slot
         gauges: NDArray[np.int16] = calibration.gauges(self.measure(1), shift=np.asarray(self.gauge_offset))[0]
         if self.saturated_axis is not None:
             gauges[self.saturated_axis] = GAUGE_MAX

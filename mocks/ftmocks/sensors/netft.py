@@ -54,7 +54,7 @@ TRANSFORM_KEYS, BIAS_KEYS = ([f"{name}{i}" for i in range(6)] for name in ("cfgt
 
 
 class Command(IntEnum):
-    """Command codes of requests."""
+    """Command codes of RDT requests."""
 
     STOP = 0x0000
     ONE_SHOT = 0x0001
@@ -65,7 +65,7 @@ class Command(IntEnum):
 
 
 class Endpoint(TypedDict):
-    """Addresses of the box."""
+    """Addresses at which a client reaches the box."""
 
     host: str
     rdt_port: int
@@ -414,7 +414,7 @@ class _HttpHandler(BaseHTTPRequestHandler):
         self.wfile.write(content or b"")
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log nothing."""
+        """Discard log messages of the HTTP server."""
 
 
 def _numbers(text: str) -> list[float]:

@@ -24,7 +24,7 @@ PORT = 63351
 
 
 class Endpoint(TypedDict):
-    """Address of the stream."""
+    """Address at which a client reaches the stream of the URCap."""
 
     host: str
     port: int
@@ -81,7 +81,7 @@ class RobotiqUrcap(Device[bytes]):
         self._pacer.start(STREAM_HZ)
 
     def _receive(self) -> None:
-        with contextlib.suppress(OSError):  # the client may have ended
+        with contextlib.suppress(OSError):  # the client may have closed the connection
             client, _ = self._socket.accept()
             client.setblocking(False)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

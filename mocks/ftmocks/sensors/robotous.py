@@ -259,7 +259,7 @@ class RobotousSensor(PtyDevice[Frame]):
 
     @property
     def _fastest_hz(self) -> float:
-        """Highest rate that can be set, Hz."""
+        """Highest sample rate that the line allows to be set, Hz."""
         return max(RATES_HZ)
 
     def _response(self, code: int, *values: int) -> bytes:

@@ -122,7 +122,7 @@ RESOURCES: dict[str, Resource] = {
         (5, 0, 107), lambda r: {"robotType": r.settings.model, "serialNumber": r.settings.serial_number}
     ),
 }
-"""Resources by their path after `BASE`."""
+"""Resources of the Robot API by their path after `BASE`."""
 
 
 def respond(robot: Robot, method: str, path: str, body: bytes) -> Answer:

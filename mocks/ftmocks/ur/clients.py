@@ -22,7 +22,7 @@ class Client(ABC):
         self._forget = forget
         self.open = True
         self.greeted = False
-        """Whether the greeting was sent."""
+        """Whether the greeting was sent to this client."""
         self._socket = connection
         self._in = bytearray()
         self._out = bytearray()
@@ -166,7 +166,7 @@ class SecondaryClient(PrimaryClient):
     kind = "secondary"
 
     def _report(self, messages: bytes) -> None:
-        """Send nothing."""
+        """Send no messages of events, which port 30002 does not have."""
 
 
 class DashboardClient(Client):
@@ -180,7 +180,7 @@ class DashboardClient(Client):
         self._opened_remote = self.robot.remote_control
 
     def greeting(self) -> bytes:
-        """Return the banner."""
+        """Return the banner of the dashboard server."""
         return dashboard.BANNER.encode() + b"\n"
 
     @property

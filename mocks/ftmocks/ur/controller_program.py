@@ -27,7 +27,7 @@ class ControllerProgram:
 
     @property
     def place(self) -> Place:
-        """Current position in the text."""
+        """Current position of the program in its text."""
         return Place()
 
     def step(self) -> bool:

@@ -36,7 +36,7 @@ class Event:
     detail: dict[str, Any]
 
     def to_json(self) -> dict[str, Any]:
-        """Return one flat JSON object."""
+        """Return the entry as one flat JSON object."""
         return {
             "t_host_ns": self.t_host_ns,
             "t_robot_s": self.t_robot_s,

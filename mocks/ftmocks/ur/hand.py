@@ -22,7 +22,7 @@ TILT_RAD = math.radians(60)
 TIPS: tuple[tuple[int, int], ...] = ((0, 0), (0, 1), (1, 0), (2, 0), (0, -1), (-1, 0))
 """Quarter turns of joints 4 and 5, with which the tool points in six directions."""
 SPINS = (0, -1, 1, 2)
-"""Quarter turns of joint 6."""
+"""Rotations of joint 6, as numbers of quarter turns."""
 IN_A_PROGRAM = 12
 """Number of orientations in the program: all directions of the tool, each with two of the spins."""
 

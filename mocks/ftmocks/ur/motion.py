@@ -41,7 +41,7 @@ PAUSE_TIME_S = 0.15
 """Time for a change of the pace, when the program pauses or the speed slider changes, s."""
 
 IDLE_DECELERATION_RAD_S2 = 8.0
-"""Deceleration of an arm without a path."""
+"""Deceleration with which a moving arm without a path comes to rest."""
 
 
 NO_WAY_ON = "the straight line leaves the workspace or meets a singularity"
@@ -242,7 +242,7 @@ class Servo:
 
     @property
     def ahead_s(self) -> float:
-        """Remaining time of the commanded targets, s."""
+        """Time until the set-point reaches the last commanded target, s."""
         return sum(command.seconds for command in self._commands) - self._into_s
 
     def command(self, command: Command) -> None:

@@ -76,7 +76,7 @@ COMMANDS: dict[str, Callable[[Robot], object]] = {
 
 
 def message(kind: int, payload: bytes, timestamp: int, source: int = FROM_CONTROLLER) -> bytes:
-    """Return the package of a message."""
+    """Return the bytes of the package that holds a message."""
     return _MESSAGE.pack(_MESSAGE.size + len(payload), ROBOT_MESSAGE, timestamp, source, kind) + payload
 
 
@@ -88,7 +88,7 @@ def greeting(robot: Robot) -> bytes:
 
 
 def version_message(robot: Robot) -> bytes:
-    """Return the first message of a connection."""
+    """Return the first message of a connection: the version."""
     major, minor, bugfix = robot.settings.polyscope
     project = b"URControl"
     numbers = struct.pack(">BBii", major, minor, bugfix, dashboard.BUILD)

@@ -41,7 +41,7 @@ RISE_S = 0.04
 """Duration of the rise and of the fall of a contact force."""
 GRASP_S = 0.2
 PART_M = 0.04
-"""Edge length of a cubic part."""
+"""Edge length of the cubic parts, m."""
 NO_PART = Body(0.0, np.zeros(3), np.zeros((3, 3)))
 
 Cycles = Generator[None, None, None]

@@ -23,14 +23,14 @@ TYPES = {
     "VECTOR6INT32": "6i",
     "VECTOR6UINT32": "6I",
 }
-"""Packing by RTDE type name."""
+"""Format of `struct` by the name of an RTDE type."""
 
 Number = bool | int | float
 Value = Number | Sequence[Number]
 
 
 class RtdeError(Exception):
-    """The bytes are not RTDE."""
+    """The received bytes are not RTDE packages."""
 
 
 def package(kind: int, payload: bytes = b"") -> bytes:

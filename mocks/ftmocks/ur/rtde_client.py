@@ -52,7 +52,7 @@ class RtdeClient(Client):
             del self._link.input_owners[name]
 
     def on_bytes(self, buffer: bytearray) -> None:
-        """Answer every complete package."""
+        """Take the complete packages from `buffer` and answer them."""
         try:
             for kind, payload in rtde.take_packages(buffer):
                 self._on_package(kind, payload)

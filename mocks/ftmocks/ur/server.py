@@ -28,7 +28,7 @@ After 2.5 s without a sample ur_rtde reconnects, stops the running program and u
 Select = selectors.BaseSelector
 _KINDS: tuple[type[Client], ...] = (PrimaryClient, SecondaryClient, ScriptClient, DashboardClient, ApiClient)
 CLIENTS = {c.kind: c for c in _KINDS}
-"""Classes of clients by kind, except RTDE."""
+"""Classes of clients by the name of their kind, except RTDE."""
 
 
 def _ports_of(polyscope: tuple[int, int, int]) -> dict[int, str]:

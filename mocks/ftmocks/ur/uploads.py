@@ -16,7 +16,7 @@ from ftmocks.ur.urscript.syntax import UrscriptSyntaxError
 
 @dataclass(frozen=True)
 class Upload:
-    """A program of a client."""
+    """Text of a program that a client has uploaded."""
 
     name: str
     text: str

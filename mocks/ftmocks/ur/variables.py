@@ -85,7 +85,7 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
     "output_bit_registers0_to_31": ("UINT32", lambda r: r.signals.registers & 0xFFFFFFFF),
     "output_bit_registers32_to_63": ("UINT32", lambda r: r.signals.registers >> 32 & 0xFFFFFFFF),
 }
-"""RTDE type and reading function of each output."""
+"""RTDE type of each output variable, and the function that reads its value."""
 
 
 def _register_readers() -> None:
@@ -139,7 +139,7 @@ INPUTS: dict[str, str] = {
     **{f"input_int_register_{i}": "INT32" for i in range(48)},
     **{f"input_double_register_{i}": "DOUBLE" for i in range(48)},
 }
-"""RTDE type of each input."""
+"""RTDE type of each input variable of the controller."""
 
 
 def output_type(robot: Robot, name: str) -> str:

@@ -43,7 +43,7 @@ class Pacer:
         self._rate_hz, self._start_s, self.made = rate_hz, self._clock.now_s(), 0
 
     def stop(self) -> None:
-        """End the stream."""
+        """End the stream: no further sample becomes due."""
         self._rate_hz = None
 
     def due(self, now_s: float) -> int:
@@ -130,7 +130,7 @@ class Device(ABC, Generic[Frame]):
         os.close(self._wake_read)
 
     def stop(self) -> None:
-        """End the device. Idempotent."""
+        """Switch the device off and end its threads. Idempotent."""
         self.unplug()
 
     def reset(self) -> None:
@@ -140,7 +140,7 @@ class Device(ABC, Generic[Frame]):
 
     @abstractmethod
     def power_up(self) -> None:
-        """Set the state after power-up."""
+        """Set the state that the device has after power-up."""
 
     def _restart(self) -> None:
         """Set the state after an interruption of the supply."""

@@ -22,7 +22,7 @@ class WrongParity(bytes):
     at: int
 
     def __new__(cls, data: bytes, at: int) -> Self:
-        """Create the bytes."""
+        """Create the bytes, one of which has wrong parity."""
         self = super().__new__(cls, data)
         self.at = at
         return self

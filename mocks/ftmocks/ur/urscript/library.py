@@ -88,7 +88,7 @@ class Caller(Protocol):
 
     @property
     def robot(self) -> Robot:
-        """The controller."""
+        """The controller on which the program runs."""
 
     @property
     def owner(self) -> str:
@@ -331,12 +331,12 @@ def get_inverse_kin(
 
 
 def get_target_joint_positions(program: Caller) -> list[float]:
-    """Return the set-points, rad."""
+    """Return the joint angles of the set-point, rad."""
     return list(program.robot.arm.q)
 
 
 def get_target_joint_speeds(program: Caller) -> list[float]:
-    """Return the speeds of the set-points, rad/s."""
+    """Return the joint speeds of the set-point, rad/s."""
     return list(program.robot.arm.qd)
 
 
@@ -407,38 +407,38 @@ def zero_ftsensor(program: Caller) -> None:
 
 
 def read_input_integer_register(program: Caller, address: Value) -> int:
-    """Return what a client wrote."""
+    """Return the number that a client wrote into this input register."""
     return program.robot.input_int(_register(address))
 
 
 def read_input_float_register(program: Caller, address: Value) -> float:
-    """Return what a client wrote."""
+    """Return the number that a client wrote into this input register."""
     return program.robot.input_double(_register(address))
 
 
 def read_output_integer_register(program: Caller, address: Value) -> int:
-    """Return what a program wrote."""
+    """Return the number that a program wrote into this output register."""
     return program.robot.output_ints[_register(address)]
 
 
 def write_output_integer_register(program: Caller, address: Value, value: Value) -> None:
-    """Write a number for the clients."""
+    """Write a number into this output register, which the clients read."""
     what = "write_output_integer_register: value"
     program.robot.output_ints[_register(address)] = whole_number(value, what, -(2**31), 2**31 - 1)
 
 
 def write_output_float_register(program: Caller, address: Value, value: Value) -> None:
-    """Write a number for the clients."""
+    """Write a number into this output register, which the clients read."""
     program.robot.output_doubles[_register(address)] = float(number(value, "write_output_float_register: value"))
 
 
 def read_output_boolean_register(program: Caller, address: Value) -> bool:
-    """Return what a program wrote."""
+    """Return the bit that a program wrote into this output register."""
     return bool(program.robot.signals.registers >> _bit_register(address) & 1)
 
 
 def write_output_boolean_register(program: Caller, address: Value, value: Value) -> None:
-    """Write a bit for the clients."""
+    """Write a bit into this output register, which the clients read."""
     program.robot.signals.registers = _with_bit(program.robot.signals.registers, _bit_register(address), value)
 
 

@@ -42,7 +42,7 @@ from ftmocks.ur.urscript.syntax import (
 from ftmocks.ur.urscript.types import check_types
 
 _LEVELS = (("or",), ("xor",), ("and",), ("not",), ("==", "!=", "<", ">", "<=", ">="), ("+", "-"), ("*", "/", "%"))
-"""Operators in ascending order of precedence."""
+"""Groups of operators in ascending order of precedence."""
 _COMPARISONS, _ARITHMETIC = _LEVELS[4], _LEVELS[5:]
 _ALONE = ("break", "continue", "halt", "pass", "enter_critical", "exit_critical")
 _WITH_VALUE = ("kill", "join")

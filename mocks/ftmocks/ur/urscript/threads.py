@@ -12,11 +12,11 @@ Run = Generator[None, None, Value]
 
 
 class Halt(Exception):
-    """The program ends itself."""
+    """Exception with which the program ends itself (``halt``)."""
 
 
 class Leave(Exception):
-    """A statement that leaves its block: break, continue, return."""
+    """Exception with which ``break``, ``continue`` or ``return`` leaves its block."""
 
     def __init__(self, word: str, value: Value = None) -> None:
         self.word, self.value = word, value

@@ -25,7 +25,7 @@ from ftmocks.ur.urscript.syntax import (
 
 _TRUTH = {"not", "and", "or", "xor", "==", "!=", "<", ">", "<=", ">="}
 Types = dict[str, str]
-"""Type of each variable."""
+"""Type of each variable, by its name."""
 
 
 def check_types(main: Function) -> None:
