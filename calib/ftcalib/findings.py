@@ -498,7 +498,7 @@ CODES: Final[Mapping[str, Code]] = {
     "together": Code(_NOTE, "{n_runs} runs were combined, each with its own bias; the result has the bias of the last "
         "run"),
     "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),
-    # Hints about single poses, shown beside the result
+    # Notes about single poses, shown with the result
     "pose_turned": Code(_NOTE, "{pose:poses} turned by {turn_deg:.2f} while it was averaged", "repeat it"),
     "pose_unsteady": Code(_NOTE, "{pose:poses} was not steady while it was averaged",
         "look for something that swings or touches the tool, and repeat the pose"),

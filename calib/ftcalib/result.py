@@ -167,7 +167,7 @@ class CalibrationResult(Displayed, Calibrated):
     response: Response | None = None
     """Gain and cross-talk of the sensor; None if not found, or if the method does not estimate them."""
     gain_sigma: float = 0.0
-    """Standard deviation of the entries of the gain, if a gain was found."""
+    """Standard deviation of the entries of the sensor's gain; None if no gain was found."""
     hidden_covariance: Array = field(default_factory=lambda: np.zeros((15, 15)))
     """(15, 15) covariance of the estimates due to errors of arm and mounts that the poses do not show."""
     cable_shift: Array | None = None
@@ -379,7 +379,7 @@ class CalibrationResult(Displayed, Calibrated):
 
     @cached_property
     def contact(self) -> ContactResponse:
-        """Response of the sensor to a contact: the decoder and its remaining errors."""
+        """Response of the sensor to a contact: decoder from readings to contact wrenches, and its remaining errors."""
         sensor = self.sensor or SensorMatrix.usual()
         # If this dataset is one of the runs with loads, their fit already contains the error of the rotation.
         is_of_loads = self.provenance.get("dataset_sha256") in (sensor.provenance.get("datasets") or ())

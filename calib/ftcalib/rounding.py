@@ -4,7 +4,7 @@ import math
 from typing import Final, SupportsFloat
 
 MOST_DECIMALS: Final = 9
-# Number of decimals of a value whose sigma is zero or unknown.
+# Number of decimals with which a value is shown if its sigma is zero or unknown.
 _UNKNOWN: Final = 4
 
 

@@ -130,7 +130,7 @@ class PoseRecord:
 
     @property
     def t_mid_ns(self) -> int:
-        """Time in the middle of the samples, on the clock of the run."""
+        """Mean of the times of the first and last sample, on the clock of the run, ns."""
         return (int(self.samples.t_host_ns[0]) + int(self.samples.t_host_ns[-1])) // 2 + self.clock_offset_ns
 
 

@@ -247,7 +247,7 @@ def sensor_error_columns(tool: Parameters, known: Response, p: Parameters, R_bas
     columns[:, :3, :9] = _products(np.eye(3), u @ lever.T, np.full((3, 3), in_force * entries[0, 1] / RANGE_LEVER_M))
     columns[:, 3:, 9:18] = _products(np.eye(3), u @ lever.T, in_torque * entries)
     columns[:, 3:, 18:] = _products(lever, u, in_force * entries)
-    # The gain for another load differs only by its part that depends on the load.
+    # Of the gain, only the part that depends on the load differs between tool and load.
     other = min(abs(p.weight_N / tool.weight_N - 1), 1.0) if tool.weight_N else 1.0
     loads = response_columns(p, R_base_flange) * np.minimum(np.sqrt(square), LOAD) * other
     return np.concatenate([columns, loads], axis=2)
@@ -325,7 +325,7 @@ class SensorMatrix(Displayed):
     lever_m: float = RANGE_LEVER_M
     """Ratio of torque range to force range, m."""
     floor: float = FLOOR
-    """Nonlinear errors relative to the load in units of the ranges, one standard deviation."""
+    """Standard deviation of nonlinear errors, relative to the load; both in units of the measuring ranges."""
     provenance: Mapping[str, JSON] = field(default_factory=dict)
     """Origin of the matrix, such as serial number, sets of loads and date."""
 
@@ -372,7 +372,7 @@ class SensorMatrix(Displayed):
         return shared
 
     def shown_variance(self, p_sensor_com_m: Array) -> Array:
-        """Return the prior variance (11,) of the gain and cross-talk seen with a tool of this centre of mass."""
+        """Return the prior variance (11,) of the gain and cross-talk that a tool with this centre of mass shows."""
         H = shown_by(p_sensor_com_m)
         return np.asarray(np.einsum("ai,ij,aj->a", H, self.covariance[3:, 3:] - self.common, H))
 

@@ -330,7 +330,7 @@ def _fit_published(
 
 
 def _constrain(method: Method, known: Known | None, setup: Setup) -> Known | None:
-    """Return the known values, including those that the method assumes."""
+    """Return the known values of the caller, plus those that the method assumes."""
     if method in ("known-rotation", "vougioukas", "wang") and (known is None or known.R_flange_sensor is None):
         known = replace(known or Known(), R_flange_sensor=np.eye(3))
     if method in ("yaw-only", "yang"):
@@ -361,7 +361,7 @@ def _fit_freely(fit_poses: Callable[..., Fit], dataset: CalibrationDataset) -> F
 def _mistakes(
     fit_poses: Callable[..., Fit], dataset: CalibrationDataset, known: Known | None, g_m_s2: float, setup: Setup
 ) -> list[Finding]:
-    """Return mistakes that explain why the parameters are not determined: faulty data, or wrong known values."""
+    """Return findings that explain undetermined parameters: mistakes in the data, or wrong known values."""
     poses = dataset.R_base_flange, dataset.wrench
     findings = faults(*poses, setup.up, _written(dataset)) or other_poses(*poses) or no_weight(*poses)
     if not findings and known is not None and (free := _fit_freely(fit_poses, dataset)) is not None:

@@ -17,7 +17,7 @@ _NAME = "ftdrive"
 
 
 def missing_extra(what: str, package: str, extra: str) -> str:
-    """Return an error message: `what`, such as "--png", needs this package, and the command that installs the extra."""
+    """Return the error message that `what`, such as "--png", needs a package, with the command to install it."""
     return f"{what} needs {package}, of the extra {extra}: install it with `{install_command(extra)}`"
 
 

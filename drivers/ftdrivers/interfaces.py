@@ -306,7 +306,7 @@ class _Device(ABC):
     def diagnose(self) -> list[Diagnosis]:
         """Run the checks that only this driver has, such as the ports of a controller. These checks only read.
 
-        The default returns an empty list.
+        The base method returns an empty list.
         """
         return []
 
@@ -400,7 +400,7 @@ class RobotArm(_Device):
     def follow(self) -> AbstractContextManager[Follow[ArmStates]]:
         """Read every state from now on, see `Follow`. There may be any number of followers, in any thread.
 
-        The default calls `state()` once per read.
+        The base method calls `state()` once per read.
         """
 
         def read(_: float) -> ArmStates:
@@ -419,7 +419,7 @@ class RobotArm(_Device):
     def controller_settings(self) -> ControllerSettings:
         """Read the load and the gravity that the controller assumes. Control is not needed.
 
-        The default returns the values that `status` reports.
+        The base method returns the values that `status` reports.
         """
         status = self.status()
         return ControllerSettings(status.payload_kg, status.p_flange_payload_m)
@@ -429,14 +429,14 @@ class RobotArm(_Device):
     ) -> None:
         """Set the payload in the controller. Needs control and an arm at rest.
 
-        The parameters are those of `ControllerSettings`; an inertia of zeros is a point mass. The default raises
+        The parameters are those of `ControllerSettings`; an inertia of zeros is a point mass. The base method raises
         `DeviceFault`.
         """
         payload = f"a payload of {mass_kg:g} kg at {[*p_flange_com_m]} m with the inertia {[*inertia_kg_m2]} kg·m²"
         raise DeviceFault(f"the driver of this arm cannot set {payload}", "set it at the controller")
 
     def set_gravity(self, up_base_m_s2: Sequence[float]) -> None:
-        """Set gravity in the controller, see `ControllerSettings`. Needs control. The default raises `DeviceFault`."""
+        """Set gravity in the controller, see `ControllerSettings`. Needs control. The base method raises `DeviceFault`."""
         gravity = f"a gravity of {[*up_base_m_s2]} m/s²"
         raise DeviceFault(f"the driver of this arm cannot set {gravity}", "set the mounting at the controller")
 
@@ -472,7 +472,7 @@ class RobotArm(_Device):
     def sweep(self, sweep: Sweep, *, guard: Guard) -> None:
         """Follow a sweep from its first posture, and return when the arm rests there again. Needs control.
 
-        `guard` and exceptions are those of `move_to`. The default raises `DeviceFault`.
+        `guard` and exceptions are those of `move_to`. The base method raises `DeviceFault`.
         """
         guard()
         raise DeviceFault(

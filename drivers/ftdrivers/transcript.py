@@ -42,9 +42,9 @@ from ftdrivers.wires.serial_port import leave_marks_to_far_side, marks_asked_for
 FORMAT: Final = "ftdrive.transcript/1"
 
 _TOGETHER_NS: Final = 2_000_000
-# Duration of one `collect`, s. Its limit of a million samples is reached after 143 s at 7 kHz.
+# Duration of one `collect` in a recording, s; its limit of a million samples is reached after 143 s at 7 kHz.
 _PIECE_S: Final = 60.0
-# Additional duration of a recording, s, because a playback may start slightly later.
+# Time, s, recorded beyond the requested duration, because a playback may start slightly later.
 _TAIL_S: Final = 0.3
 # Longest line, characters: longer than the hexadecimal form of all that a serial port can buffer.
 _LONGEST_LINE: Final = 16_000_000
@@ -118,7 +118,7 @@ class Writer:
             seen = {"error": f"{type(error).__name__}: {error}"}
             raise
         finally:
-            # A failed attempt to open the port is kept, because its error may be worth a report.
+            # The transcript of a failed attempt to open the port is kept, because its error may be worth a report.
             if not self.has_port and seen["error"] in {None, INTERRUPTED}:
                 self.discard()
             else:
@@ -307,7 +307,7 @@ def _checked_end(line: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _time_ns(line: Mapping[str, Any]) -> int:
-    float(line["t_ns"])  # beyond the range of a float, times cannot be distinguished
+    float(line["t_ns"])  # raises for a time beyond the range of a float
     return int(line["t_ns"])
 
 

@@ -59,7 +59,7 @@ VECTORS = {
     "force_drift": "force_drift_N_min",
     "torque_drift": "torque_drift_Nm_min",
 }
-"""Option names of the true vectors of the cell."""
+"""Names of the command-line options for the vectors of the true parameters."""
 
 
 def truth_from(options: Namespace) -> Truth:

@@ -27,7 +27,7 @@ MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 AHEAD_S = 0.02
 """Time, s, for which a motion is extrapolated without a new control cycle; after it, the arm stands still."""
 BURST_GAP_S = 0.001
-"""Largest gap between two bursts for which the true wrench at the end of the first burst is used again, s."""
+"""Largest gap, s, between two bursts of readings for which the true wrench at the end of the first is used again."""
 REMEMBERED = 16
 """Number of control cycles whose motion is stored, because a sensor may be later than the controller."""
 WRIST_BIAS_N, WRIST_BIAS_SPREAD = (1800.0, 400.0, 25400.0), 0.1
@@ -137,7 +137,7 @@ class Truth:
         return np.asarray(self.R_flange_sensor.T @ (p_flange_m - self.p_flange_sensor_m))
 
     def holding(self, part: Body) -> "Truth":
-        """Return the true quantities of the cell with a part in the gripper."""
+        """Return the true quantities of the cell after a part was added to the payload, held in the gripper."""
         own_m2 = self.gyration_m2
         tool = Body(self.mass_kg, self.p_sensor_com_m, np.zeros((3, 3)) if own_m2 is None else own_m2)
         mass_kg, com_m, gyration_m2 = tool.joined(part)
@@ -182,7 +182,7 @@ def _on_circle(rng: np.random.Generator) -> Array:
 
 
 class Cycle(NamedTuple):
-    """Motion of the arm, starting at a control cycle."""
+    """Motion of the arm from the start of a control cycle on."""
 
     t_s: float
     """Time of the cycle on the cell's clock."""

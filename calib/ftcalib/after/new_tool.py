@@ -23,7 +23,7 @@ from ftcalib.model import BIASES, Array, Parameters, angle_between, angle_betwee
 from ftcalib.result import CalibrationResult
 from ftcalib.sensor_matrix import LOAD, SIZE, Response, response_columns, sensor_error_columns
 
-# False-alarm probability of the test of the prior.
+# False-alarm probability of the test whether the earlier cell parameters still hold.
 FALSE_ALARMS = 1e-4
 # Indices of the rows of a `CellPrior`: three for the mounting, two for the tilt of the base.
 WHOLE = (0, 1, 2, 3, 4)
@@ -137,7 +137,7 @@ _MOST_STEPS = 30
 _SETTLED = 1e-12
 _SINGULAR = 1e12
 _SIGNIFICANT = 5.0
-# Indices of the error coordinates that runs of one tool share.
+# Indices of the error coordinates that several runs of one tool share: all except the bias.
 _SHARED = np.array([0, 1, 2, 3, 4, 5, 9, 10, 11])
 
 

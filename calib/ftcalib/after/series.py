@@ -51,9 +51,9 @@ class Difference:
     sigma: Array
     """(15,) standard deviation of the difference; 0 if both calibrations share a value or take it as exactly known."""
     joint: ChiSquare
-    """Joint test of all parameters that the calibrations do not share."""
+    """Joint chi-square test of all parameters that are not identical in both calibrations."""
     groups: Mapping[str, ChiSquare]
-    """Test of each field of `Parameters`, by its name."""
+    """Chi-square test of each field of `Parameters`, by the name of the field."""
 
     @property
     def in_sigmas(self) -> Array:
@@ -146,13 +146,13 @@ class DriftOnset:
     found: NDArray[np.bool_]
     """Whether the component drifts significantly."""
     t0_days: Array
-    """Time of the onset since the calibration, days."""
+    """Time from the calibration to the onset of the drift, days."""
     slope: Array
-    """Change of the bias per day since the onset."""
+    """Change of the bias per day since the onset of the drift, N/d and N·m/d."""
     sigma: Array
     """Standard deviation of the slope, from the stated sigmas or from the scatter, whichever is larger."""
     p_value: Array
-    """p-value of the slope, for one onset and one component."""
+    """p-value of the slope for a single given onset and component, without allowance for the search."""
 
     def __post_init__(self) -> None:
         for name in ("t0_days", "slope", "sigma", "p_value"):

@@ -136,7 +136,7 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     estimated_15[:15] = estimated
     gain = estimated_15 @ G
     mixed = kept - gain @ K
-    # The errors of kept parameters affect the new ones, so they are correlated.
+    # The errors of kept parameters affect the new parameters, so both are correlated.
     covariance = gain @ noise @ gain.T + mixed @ C @ mixed.T
     covariance = (covariance + covariance.T) / 2
     joint, dof = calibration.with_joint(covariance), 6 * n - len(x)
@@ -258,7 +258,7 @@ def _invert_information(information: Array, kind: str, n: int) -> Array:
         value = np.linalg.eigvalsh(information / units) if (scale > 0).all() else np.zeros(1)
         if value[0] > UNDETERMINED**2 * value[-1] and len(scale) <= 6 * n:
             return np.asarray(np.linalg.inv(information / units) / units)
-    except np.linalg.LinAlgError:  # singular, but rounding made the eigenvalues look acceptable
+    except np.linalg.LinAlgError:  # singular, although rounding made the eigenvalues look acceptable
         pass
     raise NotObservable(
         f"{n} {'pose does' if n == 1 else 'poses do'} not determine {kind}: add poses with other tilts of the tool."
@@ -269,7 +269,7 @@ def _invert_information(information: Array, kind: str, n: int) -> Array:
 
 # Share of good tares that are rejected.
 FALSE_ALARMS = 1e-3
-# Usual drift of a wrist sensor over hours, due to temperature, mounting and wear; one standard deviation.
+# Usual drift of the bias of a wrist sensor over hours, due to temperature, mounting, wear; one standard deviation.
 USUAL_DRIFT_N, USUAL_DRIFT_NM = 1.0, 0.03
 
 

@@ -50,7 +50,7 @@ from ftcalib.sensor_matrix import SIZE, USUAL, response_columns
 
 Change = Literal["bias", "payload", "centre of mass", "mounting", "base", "several"]
 
-# The change that corresponds to each kind of update.
+# The change of the robot cell that each kind of update accounts for.
 _SINGLE: Mapping[str, Change] = {
     "bias": "bias",
     "weight": "payload",
@@ -62,13 +62,13 @@ _SINGLE: Mapping[str, Change] = {
 _SEVERAL = ("bias and payload", "all")
 # Required reduction of chi2 per parameter of a change; one in 200 passes by chance.
 _COST = 8.0
-# Smallest p-value of the remaining misfit of a change that explains the readings.
+# A change explains the readings if the p-value of the remaining misfit is at least this.
 _UNEXPLAINED = 1e-3
 # Smallest difference in chi2 by which one change is preferred to another: odds of 100 to 1.
 _INDISTINCT = 9.2
 FEWEST = 2
 
-# Trial sizes of gain and cross-talk that the fit did not find, and of smooth errors, relative to usual ones.
+# Trial sizes, relative to the usual ones, of gain and cross-talk that the fit did not find, and of smooth errors.
 _USUAL_GAINS = np.array([0.1, 1.0])
 _USUAL_SMOOTH = np.geomspace(0.15, 2, 3)
 # Share of smooth errors that depends on joint angles rather than on the orientation, if the fit can detect it.
@@ -97,7 +97,7 @@ class Expected:
     freedom: float
     """Degrees of freedom of the estimate of the noise, or of its factor; infinite if it was not estimated."""
     factor: float = 1.0
-    """Factor of all variances, of noise and calibration; chi2 does not include it."""
+    """Factor by which all variances, of noise and calibration, are multiplied; it is not included in chi2."""
     weight: float = 1.0
     """Probability of this distribution among the alternatives for other sizes of the errors; they sum to 1."""
 
@@ -120,7 +120,7 @@ class Expected:
         return float(chi2_sf(dof, chi2) if np.isinf(self.freedom) else f_sf(dof, self.freedom, chi2 / dof))
 
     def deviance(self, chi2: float, dof: int) -> float:
-        """Return -2 log likelihood: chi2, or that of Student's distribution if the noise was estimated."""
+        """Return -2 log likelihood up to a constant: chi2, or the value of Student's t if the noise was estimated."""
         chi2 /= self.factor
         return chi2 if np.isinf(self.freedom) else (self.freedom + dof) * float(np.log1p(chi2 / self.freedom))
 
@@ -289,7 +289,7 @@ class Verification:
     """Probability of a larger chi2 if nothing has changed."""
     passed: bool
     change: Change | None
-    """The change; None if passed, or if no change explains the readings."""
+    """The change that explains the readings; None if the verification passed, or if no change explains them."""
     reason: str
     bias_change: Array
     """(6,) change of the bias since the calibration if nothing else has changed; force first, N and N·m."""
@@ -300,7 +300,7 @@ class Verification:
     alternatives: tuple[Change, ...] = ()
     """Other changes that explain the readings equally well."""
     update: Update | None = None
-    """Smallest update that accounts for the change; None if passed, or if there is none."""
+    """Smallest update that accounts for the change; None if the verification passed, or if no update does."""
 
     def __post_init__(self) -> None:
         for name in ("residual", "predicted_sigma", "bias_change", "bias_sigma", "calibration_sigma"):
@@ -380,7 +380,7 @@ def verify_calibration(
         return sum(each.weight * each.p_value(each.distance(R_base_flange, wrench)[2], 6 * n) for each in kind)
 
     p_values = [probability(explanations[0])]
-    # The second explanation has larger sigmas, so it is evaluated only if the first fails.
+    # The explanation with smooth errors has larger sigmas, so it is evaluated only if that with components fails.
     if fitted is not None and p_values[0] < false_alarms:
         smooth = expected_with_smooth_errors(calibration, fitted, R_base_flange, wrench_cov)
         if smooth:

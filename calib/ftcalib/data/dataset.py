@@ -304,7 +304,7 @@ def _covariance_problem(C: Array) -> str | None:
     return None
 
 
-# Pooling of the covariances of pose means, each from few samples.
+# Pooling of covariances of pose means that were estimated from few samples each.
 
 # Number of independent samples at which the covariance of a pose has the same weight as the common shape.
 _TRUSTED_SAMPLES = 100.0

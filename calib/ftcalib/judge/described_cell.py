@@ -40,7 +40,7 @@ TOOL_KG, TOOL_SHARE = 0.1, 0.3
 _SIGMAS_OF_MARGIN: Final = 3.0
 # Tolerance of the payload: the larger of this mass and this share of the expected payload.
 PAYLOAD_KG, PAYLOAD_SHARE = 0.5, 0.3
-# Additional tolerance of a larger payload if the mass of sensor and adapter is unknown.
+# Additional tolerance, kg, for a payload that is too large, if the mass of sensor and adapter is unknown.
 SENSOR_KG: Final = 0.3
 # A payload that differs by more than this mass (kg), but agrees in another unit within this share: wrong units.
 UNIT_KG, UNIT_SHARE = 0.8, 0.3
@@ -118,11 +118,11 @@ class Lean:
     deg: float
     sigma_deg: float
     side: str
-    """Low side of the base, such as "+y"."""
+    """Direction in base axes towards which the base leans (its low side), such as "+y"."""
 
     @property
     def is_other_mounting(self) -> bool:
-        """Whether the angle is too large for a lean."""
+        """Whether the angle is so large that the mounting of the robot is another one than described."""
         return self.deg > OTHER_MOUNTING_DEG
 
     @property
@@ -273,7 +273,7 @@ def _reach_m(cylinders_m: Sequence[Sequence[float]]) -> Array:
 
 # Known values that the data contradict.
 
-# Largest relative difference between a ratio of masses and a ratio of units.
+# A ratio of masses equals a ratio of units up to this relative difference.
 SAME_UNIT = 0.04
 # Largest difference of the entries of a rotation from -1, 0 and 1 for a permutation of the axes.
 SAME_AXES = 0.1

@@ -17,7 +17,7 @@ from ftcalib.judge.observability import RECOMMENDED_POSES
 from ftcalib.likelihood.rotation_minima import com_and_torque_bias, force_cost, given_rotation, minima
 from ftcalib.model import UP_IN_BASE, Array, Parameters, SPECIAL_R_flange_base, gravity_wrench, predict
 
-# Rounding error of readings, relative to the largest.
+# Differences between readings below this share of the largest reading are rounding errors.
 ROUNDING = 1e-9
 READINGS = {
     "orientations_inverted": "inverted orientations",
@@ -54,13 +54,13 @@ UNEQUAL = 0.05
 # False-alarm probability, per reading, of a deviation from its prediction.
 BY_CHANCE = 1e-6
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
-# Number of poses that are searched for steps of the readings.
+# Largest number of poses in which quantisation steps of the readings are searched for.
 FOR_STEPS = 1000
 # Smallest number of different readings that shows steps: a weight along the axes alone reads -weight, 0 and +weight.
 FEWEST_STEPS = 4
 # Largest number of decimal places that is searched for in written readings.
 DECIMALS = 9
-# Rounding matters if its standard deviation exceeds this share of the spread of the readings.
+# Rounding of readings matters if its standard deviation exceeds this share of their spread.
 COARSE = 0.005
 
 
@@ -87,7 +87,7 @@ class _Rough:
     force_rms_N: float
     torque_rms_Nm: float
     shares: tuple[float, float]
-    """Residual of the forces relative to the weight, and of the torques relative to their spread."""
+    """Rms residual of the forces relative to the weight, and of the torques relative to their spread."""
 
     @classmethod
     def of(cls, R_base_flange: Array, wrench: Array) -> Self:
@@ -153,7 +153,7 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
     if explanations:
         least = min(score for score, *_ in explanations)
         equal = [explanation for explanation in explanations if explanation[0] < least + EQUAL]
-        # Of equally good explanations the simplest is reported.
+        # Of the mistakes that explain the data equally well, the simplest is reported.
         _, code, values, corrected_N = equal[0]
         also = dict.fromkeys(READINGS[name].format(**own) for _, name, own, _ in equal[1:] if name in READINGS)
         if code in READINGS:

@@ -50,7 +50,7 @@ class Observability:
     condition: float
     """Ratio of the extreme eigenvalues of the scaled Fisher information; infinite below rank 15."""
     ambiguities: tuple[str, ...]
-    """Clauses: first the reason, then the parameters that cannot be separated. Empty for a sound set."""
+    """Parts of a sentence: the reason, then the parameters that cannot be separated. Empty for a sound set."""
     advice: tuple[str, ...]
     """Phrases that describe the poses to add, relative to the last pose of the set."""
     advised_R_base_flange: Array
@@ -60,7 +60,7 @@ class Observability:
 
     @property
     def sound(self) -> bool:
-        """Whether there are four orientations, full rank, a fair condition, and a clearly worse second solution."""
+        """Whether the set has four orientations, full rank, a fair condition, and a clearly worse second solution."""
         enough = self.orientations >= LEAST_POSES and self.rank == 15
         return enough and self.condition <= POOR_CONDITION and self.second_gap >= WEAK_GAP
 

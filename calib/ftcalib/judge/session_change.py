@@ -39,7 +39,7 @@ from ftcalib.sensor_matrix import response_columns
 
 # With fewer poses than this, a change cannot be separated from the 15 parameters.
 FEWEST_POSES = 10
-# Smallest number of poses before and after a change.
+# Smallest number of poses before a change, and after it.
 FEWEST_ON_A_SIDE = 3
 # Largest number of poses that are searched for a change: normally, and in sessions of more than 1000 poses.
 MOST_POSES, OF_MANY = 300, 150
@@ -60,7 +60,7 @@ BEAM = 4
 Steps = tuple[int, ...]
 Rows = NDArray[np.integer | np.bool_]
 
-# Column indices of `_change_columns`.
+# Indices of the columns of the matrix that `_change_columns` returns.
 TURN, BIAS, COM, LOAD, MOUNTING = range(3), range(3, 9), range(10, 13), range(9, 13), range(13, 16)
 # Columns of the parameters that change, by code. A sensor usually turns together with its tool.
 KINDS = {
@@ -77,7 +77,7 @@ CHANGES = frozenset(("sensors_alternate", *KINDS))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionChange:
-    """Change of some rows relative to the others."""
+    """Change during a session: some rows (poses) differ from the others."""
 
     code: str
     rows: Rows
@@ -254,7 +254,7 @@ def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
         return dict(zip(added, square.tolist(), strict=True))
 
     everything = total - means(np.array([0]), np.array([n]))
-    # One step must be better than none, and each further step clearly better.
+    # One step of the bias must reduce the misfit, and each further step must reduce it clearly.
     least = 3 * n * float(np.log(square_left(everything, 0)[0])) + LARGER_MARGIN
     best, beam = Steps(), [Steps()]
     for count in range(1, min(MOST_STEPS, n - 2 - _SHAPE // 3) + 1):
@@ -284,7 +284,7 @@ def _less_means(values: Array, steps: Sequence[int]) -> Array:
 
 
 def _groups(n: int) -> Iterator[tuple[slice | None, NDArray[np.bool_]]]:
-    """Yield rows that may be unchanged (None: all), and the groups of other rows that may have changed."""
+    """Yield rows that may be unchanged (None: all), each time with groups of other rows that may have changed."""
     after = np.arange(n) >= np.arange(FEWEST_ON_A_SIDE, n - FEWEST_ON_A_SIDE + 1)[:, None]
     half, every_other = n // 2, np.arange(n)[None] % 2 == 1
     yield None, np.concatenate([after, every_other])
@@ -352,7 +352,7 @@ def _refine(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, row
         "change_N": float(moved[9] if rows[-1] else -moved[9]),
         "shift_mm": 1e3 * _norm(moved[COM]),
     }
-    # BIC: kinds of change with more parameters must explain more.
+    # BIC: a kind of change with more parameters must explain more.
     criterion = wrench.size * np.log(max(misfit, 1e-300)) + len(own) * np.log(wrench.size)
     return SessionChange(code, rows, values, undone - C @ x[: len(own)] + p.bias, misfit, float(criterion))
 

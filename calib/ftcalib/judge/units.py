@@ -41,7 +41,7 @@ Suspects = list[tuple[str, str]]
 
 
 def by_com(com_m: float, forces: Collection[str] = tuple(FORCE_UNITS_N)) -> Suspects:
-    """Return pairs of wrong units, with the given units of force, that explain the distance of the centre of mass."""
+    """Return the pairs of wrong units, with a given unit of force, that explain how far the centre of mass is."""
     low, high = USUAL_COM_M
     return [
         (force, torque)

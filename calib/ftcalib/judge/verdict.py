@@ -56,7 +56,7 @@ SURE = 1e-3
 
 # Assumed interval between poses if their times are unknown.
 USUAL_INTERVAL_S = 10.0
-# Time from the last pose to the next use.
+# Assumed time from the last pose of a tour to the next use of its calibration.
 NEXT_USE_S = 60.0
 HOUR = 3600.0 / NEXT_USE_S
 # Time constant of a warm-up of 10 to 30 min, of which a linear drift is usually the beginning.
@@ -147,7 +147,7 @@ class Quality:
     largest_share: float
     """Largest error of force or torque relative to the weight."""
     errors: list[Finding]
-    """Findings for errors of force and torque that are too large."""
+    """Findings about errors of force and torque that exceed the limits of the verdict."""
     loo_force_rms_N: float
     """Leave-one-out rms error of force over the used poses, N."""
     loo_torque_rms_Nm: float
@@ -310,7 +310,7 @@ def find_other_poses(case: Case, quality: Quality) -> list[Finding]:
     found, order = case.found, _some_runs(case.t_s, len(quality.used))
     kept = order[quality.used[order]]
     named = other_poses(found.R_base_flange[kept], found.wrench[kept])
-    # Poses that fit by chance do not show the error of the others.
+    # Poses that happen to fit do not show how large the error of the other poses is.
     if named and not _few_rejected(quality.used):
         named = other_poses(found.R_base_flange[order], found.wrench[order]) or named
     return named
@@ -557,7 +557,7 @@ def _structure_findings(found: Estimate) -> list[Finding]:
 def _structure_in_motion(found: Estimate) -> list[Finding]:
     """Return findings for smooth errors in motion, with lower limits because averaging leaves little noise."""
     load, pull = (_component_sizes(found, f"{name}_N", f"{name}_Nm") for name in ("load", "cable"))
-    # Orientation errors up to those of calibrated arms are accepted.
+    # In motion, orientation errors up to those of calibrated arms are accepted.
     limits = SMOOTH_SHARE, SMOOTH_SHARE, np.array([SMOOTH_SHARE, CALIBRATED_ARM_RAD])
     return _smooth_error_findings(
         found, load / _per_N(found), pull, _component_sizes(found, "yielding_rad", "rotation_rad"), limits
@@ -576,7 +576,7 @@ def _per_N(found: Estimate) -> Array:
 def _smooth_error_findings(
     found: Estimate, load: Array, pull: Array, turn_rad: Array, limits: Sequence[Array | float], least: float = np.inf
 ) -> list[Finding]:
-    """Return findings for nonlinear response (2,), cable (2,) and orientation errors (k,); notes from `least` on."""
+    """Return findings on nonlinear response (2,), cable (2,), orientation (k,); notes from `least` to `limits`."""
     findings = []
     for code, share, limit, values in (
         ("response_not_linear", load, limits[0], {"share_percent": 100 * float(load.max())}),

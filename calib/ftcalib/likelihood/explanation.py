@@ -58,7 +58,7 @@ from ftcalib.likelihood.variance_components import (
 )
 from ftcalib.model import Array, Parameters, predict
 
-# Selection of the components: forward, backward and by exchange.
+# Selection of the variance components: forward, backward and by exchange.
 
 # A component that changes the log-likelihood by more is certain: no other component can compensate its absence.
 SURE = 20.0
@@ -281,15 +281,15 @@ MANY_POSES = 20_000
 SEARCHED = 300
 # With fewer poses than this, the distribution of the Mahalanobis distances is not tested.
 POSES_FOR_THE_SHAPE = 500
-# P-value of chi2 below which components are searched for.
+# If the p-value of chi2 is below this, variance components are searched for.
 SUSPICIOUS = 0.01
 # Ratio of median to mean of the squared Mahalanobis distances, relative to Gaussian noise; less suggests outliers.
 LIGHT_TAIL = 0.6
-# Largest number of iterations of the outer loop.
+# Largest number of iterations of each loop of the search.
 ROUNDS = 20
 # Convergence: squared step, in standard deviations of the estimates.
 SETTLED = 1e-4
-# Difference in chi2 above which a minimum is excluded under any noise model.
+# A minimum whose chi2 is larger by more than this than the lowest is excluded, whatever the noise model.
 FAR = 1000.0
 MEDIAN_DISTANCE = float(chi2_isf(6, 0.5))
 
@@ -311,7 +311,7 @@ class Explanation:
 
     @property
     def noise_moves(self) -> bool:
-        """Whether the noise model depends on the parameters."""
+        """Whether the noise model depends on the parameters, as it does with orientation errors, gain or cross-talk."""
         return not {"rotation", *EFFECTS}.isdisjoint(c.kind for c in self.components)
 
 
@@ -448,7 +448,7 @@ def _improve(session: SessionData, p: Parameters, kept: Kept) -> Explanation:
 
 
 def _first_explanation(session: SessionData, p: Parameters, kept: Kept) -> tuple[Explanation, Linearised, Point]:
-    """Return the initial explanation, from a first selection of components."""
+    """Return the explanation from which the search starts, after a first selection of variance components."""
     problem, always = session.linearise(p, kept), session.always()
     at = select_explanation(problem, always, session.start(problem, always), session.candidates(), len(always))
     return Explanation(p, kept), problem, at
@@ -528,7 +528,7 @@ def _with_all_minima(session: SessionData, e: Explanation, others: list[Minimum]
     ends = [
         session.descent.down(statistics, start) for start in (e.parameters, *(minimum.parameters for minimum in others))
     ]
-    if e.noise_moves:  # compare the minima, each evaluated with its own noise
+    if e.noise_moves:  # compare the minima, each under the noise model that belongs to it
         least = ends[0].chi2
         ends = [_under_own_noise(session, e, end, logdet) if end.chi2 < least + FAR else end for end in ends]
     return session.descent.distinct(ends)

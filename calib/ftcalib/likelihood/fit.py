@@ -167,7 +167,7 @@ class Fit(Estimate):
     information: Array
     """(15, 15) Fisher information of the error coordinates `PARAMETER_NAMES`, including priors."""
     order: NDArray[np.intp]
-    """(n,) indices that sort the rows by time."""
+    """(n,) indices that sort the poses by time."""
     given_noise: Array
     """(15, 15) covariance of the parameters if the noise model is taken as known."""
     lag: tuple[Array, Array] | None
@@ -336,7 +336,7 @@ def _left_out_error(found: Fit) -> float:
 
 
 def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_chi2: float) -> Fit:
-    """Return the fit that follows from an explanation; the arguments are the results of `explain`."""
+    """Return the `Fit` with estimates and covariance for an explanation; the arguments are the results of `explain`."""
     best = minima[0]
     if not best.settled:
         weight_N = best.parameters.weight_N
@@ -421,7 +421,7 @@ def _second_basin_chi2(minima: Sequence[float], components: Iterable[str], dof: 
 
 
 def _deviation(session: SessionData, c: Component, variance: float) -> float:
-    """Return the standard deviation of a component; estimated white noise includes its lower bound."""
+    """Return the standard deviation of a variance component; for estimated white noise, with its lower bound added."""
     least = 0.0 if session.measured or c.kind != "white" else session.cov[0][np.argmax(c.share), np.argmax(c.share)]
     return float(np.sqrt(variance + least))
 

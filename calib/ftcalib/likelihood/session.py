@@ -54,7 +54,7 @@ FEW_POSES_FOR_GAIN = 12
 FEW_POSES_WITHOUT_NOISE = 12
 # With fewer poses than this, hysteresis is not separated from gain and noise.
 FEW_POSES_FOR_HYSTERESIS = 12
-# With fewer poses than this, the axes of a group share one drift.
+# With fewer poses than this, the three axes of force share one drift variance, and so do those of torque.
 POSES_FOR_EACH_AXIS = 50
 # Residuals up to this multiple of the rounding error mean that the data have no noise.
 EXACT = 100
@@ -87,7 +87,7 @@ class SessionData:
     ) -> None:
         self.n = len(wrench)
         self.gain_sigma, self.structured = gain_sigma, True
-        # Components found in a subset of many poses; no other walk or structured error is searched for.
+        # Components that were found in a subset of the poses; no other random walk or structured error is searched for.
         self.shown: Sequence[Component] | None = None
         self.given = R_base_flange, wrench
         self.drift, self.constraints = drift, constraints

@@ -38,7 +38,7 @@ def structure_columns(parameters: Parameters, R_base_flange: Array, middle: Arra
     }
 
 
-# Correlation length of orientation errors of the arm and of cable forces.
+# Angle over which orientation errors of the arm and cable forces are correlated.
 SMOOTH_RAD = 1.2
 
 
@@ -147,7 +147,7 @@ def _of_each_channel(basis: Array) -> Array:
 # The six shares, one for each axis, have a common variance. The step to the first pose is unknown, so a usual step is
 # assumed for it. The compensation does not model steps, so hysteresis is part of the noise of a reading.
 
-# With more poses than this, the unknown step to the first pose is negligible.
+# With more poses than this, hysteresis from the unknown step to the first pose is negligible.
 FEW = 1000
 
 

@@ -72,11 +72,11 @@ class Component:
     name: str
     kind: Kind
     share: tuple[float, ...]
-    """(6,) factors of the variance in each channel."""
+    """(6,) factors with which the variance acts on each channel; 0 for channels without it."""
 
     @property
     def needed(self) -> float:
-        """Smallest gain in log-likelihood for which the component is kept."""
+        """Smallest gain in restricted log-likelihood for which the component is kept in the model."""
         return GAIN_OF_RESPONSE if self.kind in EFFECTS else GAIN
 
 
@@ -119,7 +119,7 @@ class Linearised:
     kept: NDArray[np.bool_]
     """(n,) whether a pose is used."""
     slope: bool
-    """Whether a linear drift of unknown size is part of the model."""
+    """Whether a linear drift of the bias, of unknown size, is part of the model."""
     effects: Mapping[str, Array]
     """(n, 6, k) derivative with respect to the coefficients of each kind of `EFFECTS`."""
     lever: float = 0.0
@@ -311,7 +311,7 @@ def squared_length(e: Array, S: Array) -> Array:
 
 
 def point(problem: Linearised, components: Sequence[Component], theta: Array, near: Point | None = None) -> Point:
-    """Return the restricted likelihood at given variances; sums of `near` are reused if its noise is the same."""
+    """Return the restricted likelihood at given variances; sums of the `Point` `near` are reused for equal noise."""
     m, effects, of_poses = problem.J.shape[2], [], []
     for c, value in zip(components, theta, strict=True):
         columns = problem.columns(c)

@@ -19,7 +19,7 @@ from ftcalib.display import Displayed
 from ftcalib.model import Array, cross, rotation_of, skew
 from ftcalib.sensor_matrix import SensorMatrix, ranges
 
-# Standard deviation of the sensor origin, an error common to all positions.
+# Standard deviation of the position of the sensor origin, m, an error common to all declared positions.
 ORIGIN_M = 0.0005
 # Usual standard deviation of each disturbance, and the sigma of its logarithm. If the noise of the poses was not
 # measured, it is part of the white noise.
@@ -110,7 +110,7 @@ _MISTAKES: Mapping[Kind, list[float]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linear:
-    """Model linearised at its current values; one list entry per run."""
+    """Model of the runs, linearised at its current values; each list has one entry per run."""
 
     J: list[Array]
     """(6n, k) derivatives of the readings with respect to all unknowns."""
@@ -126,7 +126,7 @@ class Linear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluated:
-    """Marginal likelihood at given sizes of the disturbances, and the Gauss-Newton step."""
+    """Marginal likelihood at given standard deviations of the disturbances, and the Gauss-Newton step."""
 
     cost: float
     """-2 log marginal likelihood up to a constant, including the priors of the sizes."""

@@ -27,9 +27,9 @@ _CLEARLY = 12.0
 _MOST_MISTAKES = 4
 # Number of candidate mistakes, the most promising ones, for which the whole fit is repeated.
 _TRIED = 4
-# Largest residual of a linear sensor, as a share of the load.
+# A residual above this share of the load means that the sensor is not linear.
 _MOST_REMAINING = 0.03
-# Largest accepted change of an entry of the matrix, in sigmas of the prior.
+# An entry of the matrix may differ from its prior by at most this many sigmas of the prior.
 _MOST_CHANGE = 5.0
 _POUND_KG = 0.45359237
 AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
@@ -178,7 +178,7 @@ def _first_model(
 
 
 def _fit_loads(model: LoadModel, logarithms: Array) -> tuple[LoadModel, Array, Evaluated]:
-    """Return a model at its best values, with the most likely sizes of the disturbances."""
+    """Return a model with its best-fitting unknowns and the most likely sizes of the disturbances."""
     for _ in range(2):
         for _ in range(3):
             model.move(model.evaluate(logarithms, model.linear()).step)

@@ -84,7 +84,7 @@ class MotionFit:
     covariance: Array
     """(34, 34) covariance of the error vector of `MovingLoad.moved`."""
     kept: NDArray[np.bool_]
-    """(n,) whether a row is free of contact."""
+    """(n,) whether a row is free of contact, so that the fit uses it."""
     residuals: Array
     """(n, 6) measured minus predicted wrench of all rows; the prediction has the drift, but no other random effect."""
     next_use: Array
@@ -250,7 +250,7 @@ def _join(
 
 
 def _rough(problem: Problem, load: MovingLoad) -> tuple[MovingLoad, float]:
-    """Fit robustly with white noise; return the load and the sum of the logarithms of the residual scales."""
+    """Fit a load robustly, with white noise; return it and the sum of the logarithms of the residual scales."""
     rows = problem.rows[:: max(1, len(problem.rows) // ROUGH_ROWS)]
     limit, size = np.inf, SIZE + problem.basis.shape[1]
     no_effects, H, b = np.zeros(len(problem.basis)), np.zeros((size, size)), np.zeros(size)
@@ -289,7 +289,7 @@ def rough_delay(rows: MotionRows, known: Known | None, g_m_s2: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeFit:
-    """Robust fit of a load and of an error of the poses."""
+    """Robust fit of a moving load and of an error of the recorded poses (`PoseError`)."""
 
     load: MovingLoad
     error: PoseError

@@ -34,7 +34,7 @@ _EXPLAINED: Final = np.array([0.15, 0.3])
 _SUSPECT: Final = 0.05
 # A weight below this share of the inertial mass means that the wrench was gravity-compensated.
 COMPENSATED: Final = 0.2
-# A mistake must exceed this many sigmas, and also the errors of a calibrated arm, which are not part of sigma.
+# A pose error counts as a mistake above this many sigmas and the errors of a calibrated arm, which sigma lacks.
 _SIGMAS: Final = 6.0
 _CLOCK_SHARE: Final = 0.03
 _ASIDE_M: Final = 0.01
@@ -127,7 +127,7 @@ def are_bias_steps(steps: Array, seen: Array) -> Array:
 
 
 def without_steps(wrench: Stream, at_s: Array, steps: Array) -> Stream:
-    """Return the wrench with the steps removed: with the bias after the last step throughout."""
+    """Return the wrench without bias steps: the bias is that after the last step throughout."""
     t_s, y = wrench
     return t_s, y + (t_s[:, None] <= at_s).astype(np.float64) @ steps
 
@@ -167,7 +167,7 @@ def find_motion_mistakes(rows: MotionRows, free: FreeFit, spread_m: float) -> tu
     factor = 1 / float(np.sqrt(max(fitted, 1e-12)))
     off, share = abs(fitted - 1) / max(sigma_scale, 1e-12), abs(factor - 1)
     values = {"factor": factor, "sigma": factor * sigma_scale / max(fitted, 1e-12) / 2, "rate": 1 / factor}
-    # A weight too small for the acceleration has two possible causes. Compensation is more likely than wrong times.
+    # A weight too small for the acceleration means a partly compensated wrench or wrong times; the former is likelier.
     weight_N = load.static.weight_N
     parted = {"weight_N": weight_N, "mass_kg": fitted * weight_N / load.g_m_s2} if fitted > 1 else None
     if off > _SIGMAS and share > _CLOCK_SHARE:
@@ -201,7 +201,7 @@ def _by_clock(severity: Severity, of_clock: Mapping[str, float], parted: Mapping
 
 
 def _axis_findings(rows: MotionRows, change: Array) -> list[Finding]:
-    """Find wrong axes and orientations in the wrench with the effect of acceleration removed."""
+    """Find wrong axes and orientations from the wrench, after the effect of acceleration was removed."""
     static, left = static_wrench(rows)
     if (left > _EXPLAINED * change).any():
         return []

@@ -103,7 +103,7 @@ class PoseError:
     """Scale of `Motion.Omega_rad2_s2`: equal to `scale` if the times are wrong, 1 if only the positions are wrong."""
 
     def undone(self, motion: Motion) -> Motion:
-        """Return a motion, or the rate of change of a motion, with the error removed."""
+        """Return a motion, or the rate of change of a motion, without the error of the poses."""
         Omega = self.turning * motion.Omega_rad2_s2
         acceleration = self.scale * motion.acceleration_m_s2 + Omega[:, :, :2] @ self.aside_m
         return Motion(motion.R_base_flange, acceleration, Omega)
@@ -114,7 +114,7 @@ class PoseError:
 
     @staticmethod
     def jacobian(load: MovingLoad, motion: Motion) -> Array:
-        """Return the derivative (n, 6, 3) of the wrench in `scale` and `aside_m`, for the motion with the error."""
+        """Return the derivative (n, 6, 3) of the wrench by `scale` and `aside_m`, for the motion as recorded."""
         static, Omega = load.static, motion.Omega_rad2_s2
         moved = np.concatenate([motion.acceleration_m_s2[:, :, None], Omega[:, :, :2]], axis=2)
         dU = -load.mass_kg * static.R_flange_sensor.T @ moved
@@ -177,7 +177,7 @@ class SmoothFunctions:
     weights: Array
     """(m, k) weights of these orientations in each component."""
     mean: Array
-    """(m,) mean of the kernel, subtracted before weighting."""
+    """(m,) mean of the kernel over the recording, which is subtracted before the weights are applied."""
 
     @classmethod
     def of(cls, R_base_flange: Array) -> Self:
@@ -193,7 +193,7 @@ class SmoothFunctions:
         return int(self.weights.shape[1])
 
     def __call__(self, R_base_flange: Array) -> Array:
-        """Return the values (n, k) of the components."""
+        """Return the values (n, k) of the k components at orientations (n, 3, 3)."""
         return np.asarray((alike(R_base_flange, self.R_base_flange) - self.mean) @ self.weights)
 
 

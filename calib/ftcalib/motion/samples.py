@@ -40,7 +40,7 @@ LATEST_S = 1e11
 
 # (11, 3) value and first two derivatives of a quartic fitted to 110 ms of poses; the response is flat over the band.
 _FIT = np.linalg.pinv(np.vander(MEAN_S * np.arange(-5, 6), 5, increasing=True))[:3].T * [1.0, 1.0, 2.0]
-# A mean with a smaller total weight of samples than this is discarded.
+# A 10 ms mean is discarded if the total weight of its samples is below this.
 _LEAST_WEIGHT = 1e-3
 # Number of rows filtered at once.
 _CHUNK = 600
@@ -93,7 +93,7 @@ class SampleClock:
         self.restart()
 
     def restart(self) -> None:
-        """Discard the line after an interruption, during which the device may not have counted."""
+        """Discard the fitted clock line after an interruption, during which the device may not have counted."""
         self._points: deque[tuple[float, float]] = deque(maxlen=_BUCKETS)
         self._origin: tuple[float, int] | None = None
         self._slope, self._offset = self._nominal_ns, 0.0

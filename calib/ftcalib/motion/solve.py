@@ -54,9 +54,9 @@ LEAST_S = 5.0
 FARTHEST_S = 1.5
 # A delay of the wrench longer than this, s, is reported as a clock error.
 OFFSET_S = 0.1
-# Largest residual delay at which scale and signs of the motion are reliable.
+# Up to this remaining delay, s, scale and signs of the motion are reliable.
 ALIGNED_S = 0.02
-# Largest residual delay at which the model is linear in the delay.
+# Up to this remaining delay, s, the model is linear in the delay.
 LINEAR_S = 2e-3
 # Without positions the acceleration is unknown, and only rows slower than this are used.
 SLOW_RAD_S = 0.15
@@ -67,10 +67,10 @@ _FOLLOWS, _OTHER_RATE = 0.03, 0.5
 _SAME_RATE, _RATIOS = 3e-3, 1 + np.linspace(-0.06, 0.06, 49)
 # Interpolation error above which poses are too coarse for their motion; then only rows slower than this are used.
 _COARSE_RAD, _REST_RAD_S = 8e-3, 0.02
-# Radius at which an arm moves the flange. It bounds the unknown acceleration if positions are missing.
+# Assumed radius of the flange's motion, m. It bounds the unknown acceleration if positions are missing.
 REACH_M = 1.0
 NARROW_DEG = 45.0
-# A parameter is determined if its sigma is below this share of its prior sigma.
+# A parameter counts as determined by the motion if its sigma is below this share of its prior sigma.
 MEASURED = 0.3
 WRONG_HEIGHT_M = 3e-3
 # A larger share of rows in contact limits the result.

@@ -28,7 +28,7 @@ Indices = NDArray[np.intp]
 PRIOR = 1e-4
 # Weight of the second term of the criterion of `choose`, which penalises gravity directions in one plane.
 WEIGHT_OF_PLANE = 0.3
-# Smallest number of poses that determines all parameters.
+# Smallest number of poses with which all parameters can be determined.
 FEWEST = 4
 # Gap to the second solution (see `second_basin`) from which no poses are added to widen it.
 LEAST_GAP = 0.05

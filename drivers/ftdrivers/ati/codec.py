@@ -144,7 +144,7 @@ def _unpack(form: str, data: bytes, what: str) -> tuple[int, ...]:
     return struct.unpack(form, data)
 
 
-# ------------------------------------------------------------------------------------ from counts to N, on every wire
+# -------------------------------------------------------------------------- from counts to N, for all ATI interfaces
 
 FORCE_UNITS_N = {
     "lbf": 4.4482216152605,

@@ -209,7 +209,7 @@ class AtiSerialSensor(StreamingSensor):
         self._damaged.clear()
 
     def _restart(self) -> None:
-        # A restart takes 40 ms. The number of records lost meanwhile is estimated from the clock.
+        # A restart of the stream takes 40 ms. The number of records lost meanwhile is estimated from the clock.
         self._restarts += 1
         if self._restarts > _MAX_RESTARTS:
             raise ProtocolError(

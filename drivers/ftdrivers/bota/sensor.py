@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 # Baud rates of the vendor's examples, and of its ROS 2 driver.
 _USUAL_BAUDS = (460_800, codec.DEFAULT_BAUD)
-# Number of frames whose median spacing gives the sample period.
+# Number of frames from whose median spacing the sample period is estimated.
 _FIRST_FRAMES = 8
 # Time-out for a sensor that boots, s.
 _BOOT_S = 5.0
@@ -132,7 +132,7 @@ class BotaSensor(StreamingSensor):
         )
 
     def _disconnect(self) -> None:
-        # The sensor continues to stream, as before it was opened.
+        # Nothing is sent: the sensor continues to stream, as before it was opened.
         self._port.close()
 
     def _find(self) -> list[codec.Frame]:
@@ -195,7 +195,7 @@ class BotaSensor(StreamingSensor):
         raise DeviceTimeout(f"{self._frames.arrived} within {self._clock.now_s() - begin_s:.1f} s")
 
     def _elapse(self, t_us: int) -> tuple[int, int]:
-        """Unwrap a time of the sensor's clock; return (time in µs, sequence number)."""
+        """Undo the overflow of a time on the sensor's clock; return (time in µs, sequence number)."""
         step_us = (t_us - self._t_us) % _CLOCK
         if step_us > _CLOCK // 2:
             raise StreamBroken(

@@ -20,9 +20,9 @@ from ftdrivers.wires.framing import ENOUGH_FRAMES
 _SILENCE_S = 0.002
 # Largest relative deviation of the rate: manual and the vendor's header file differ by 0.1 for one rate.
 _DRIFT = 0.12
-# Fraction of a period by which the host may be late if all fields have arrived.
+# Fraction of a sample period by which the last field may be late if all fields have arrived.
 _LATE = 0.5
-# Fraction of a period by which the clock may be late when missing fields are counted.
+# Fraction of a sample period by which the clock may be late when missing fields are counted.
 _EARLY = 0.25
 _MOST_WAITING = 1000
 

@@ -26,7 +26,7 @@ FRAME_SIZE = REPLY_SIZE + 3
 AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 RATE_CODES = {10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8}
-"""Code of each output rate in Hz. A new sensor reports code 0, which means 200 Hz."""
+"""Code of each output rate (Hz) in commands and replies. A new sensor reports code 0, which means 200 Hz."""
 
 DEFAULT_BAUD = 115_200
 

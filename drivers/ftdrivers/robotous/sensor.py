@@ -81,7 +81,7 @@ class RobotousSensor(StreamingSensor):
 
     @abstractmethod
     def _damaged(self) -> int:
-        """Return the number of damaged or incomplete fields since the device was connected."""
+        """Return a counter of damaged or incomplete fields, which never decreases."""
 
     def _start_stream(self, _rate_Hz: int) -> None:
         self._send(codec.encode(Command.START))

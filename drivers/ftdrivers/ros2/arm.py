@@ -23,12 +23,12 @@ from ftdrivers.ros2.middleware import Node, OnePublisher, Received, clock_diagno
 from ftdrivers.ros2.poses import Chain, Joints, PoseReader, Poses, StampedPose, Transforms
 
 SCHEME: Final = "ros2:"
-# Time-out from the discovery of the publisher to the first pose, s.
+# Time-out from the discovery of the publishing node to its first pose, s.
 _FIRST_S: Final = 2.0
 _STALE_S: Final = 0.3
-# Interval over which the speed is averaged, because encoders have steps and stamps have jitter.
+# Interval over which the speed is averaged, s, because encoders have steps and time stamps have jitter.
 _SPEED_NS: Final = 100_000_000
-# Lever with which a translation is converted to an angle.
+# Lever with which a translation of the flange is converted to an angle, m.
 _LEVER_M: Final = 1.0
 _MOST_UNREAD: Final = 1_000_000
 # Stamps that go back by more than this, s, come from another clock.

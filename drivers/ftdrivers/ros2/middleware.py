@@ -22,7 +22,7 @@ _PROFILES: Final = {"FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_
 
 
 def ros2_module(name: str) -> Any:
-    """Import a ROS 2 module, such as "rclpy" or "geometry_msgs.msg". Raises `NoRos2`."""
+    """Import a ROS 2 module, such as "rclpy" or "geometry_msgs.msg". Raises `NoRos2` if it is missing."""
     # The ROS wheels restart Python to set LD_LIBRARY_PATH (30 ms). They lack tf2_msgs, so tf needs a sourced ROS.
     try:
         return importlib.import_module(name)
@@ -113,11 +113,11 @@ class Node:
 DISCOVERY_S: Final = 3.0
 """Time-out until the publishers of a topic are known, s."""
 _SAME_CLOCK_MS: Final = 2.0
-# A stamp that is older than this by the clock of this computer comes from another clock.
+# A time stamp older than this by the clock of this computer must be from another clock.
 _LONGEST_WAY_MS: Final = 30.0
 # Time after the first publisher of a topic within which a second one is discovered too.
 _OTHERS_S: Final = 0.5
-# Interval between two checks whether another node publishes too.
+# Interval between two checks whether another node publishes the same topic, s.
 _LOOK_S: Final = 1.0
 _UNNAMED: Final = "NAME_UNKNOWN"
 _UNNUMBERED: Final = (1 << 64) - 1

@@ -113,7 +113,7 @@ class Rate:
         self._since_ns, self._samples = 0, 0
 
     def judge(self, samples: int, t_host_ns: int, nominal_Hz: float) -> str | None:
-        """Return a note for the log when the rate becomes wrong, and when it is right again; otherwise None."""
+        """Return a text for the log when the rate becomes wrong, and when it is right again; otherwise None."""
         if math.isnan(nominal_Hz):
             return None
         self._samples += samples

@@ -362,7 +362,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._take_turn()
 
     def _take_turn(self) -> None:
-        """Read and publish one block, or try to reconnect; store an error that ends the stream."""
+        """Read one block of samples and publish it, or try to reconnect; store an error that ends the stream."""
         try:
             try:
                 self._pump()
@@ -568,11 +568,11 @@ class StreamingSensor(ForceTorqueSensor):
         return DeviceTimeout(found, self._silence_fix())
 
     def _silence_fix(self) -> str:
-        """Return what the user should do about a silence; a subclass may be more specific."""
+        """Return a text: what the user should do if no sample arrives; a subclass may be more specific."""
         return "check cable and supply"
 
     def _rate_fix(self, rate_Hz: float) -> str:
-        """Return what the user should do if the rate is not nominal; a subclass may be more specific."""
+        """Return a text: what the user should do if the rate is not nominal; a subclass may be more specific."""
         cause = "lost" if rate_Hz < self._nominal_Hz else "duplicated"
         return f"check health() for {cause} samples, and check the rate that is set in the sensor"
 

@@ -386,7 +386,7 @@ class UrArm(RobotArm):
         self._goal = None
         with self._stopping_on_error():
             self._look_out()
-        self._check_ours(control)  # if another program runs, it is not stopped
+        self._check_ours(control)  # a program of another client is not stopped
         guard()
         self._moves_at_rad_s = speed_rad_s
         with self._stopping_on_error():
@@ -594,7 +594,7 @@ class UrArm(RobotArm):
         return self._control
 
     def _reading(self) -> Reader:
-        reader = self._reader  # read once, because another thread may close the arm meanwhile
+        reader = self._reader  # one read, because another thread may close the arm
         if reader is None:
             raise ConnectError(f"the arm at {self._host} is not open", "open it first")
         return reader

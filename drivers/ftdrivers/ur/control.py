@@ -19,7 +19,7 @@ STOP_RAD_S2: Final = radians(300)
 """Default deceleration of a stop, rad/s². UR's own programs use 2 to 4 rad/s²."""
 
 LookOut = Callable[[], object]
-"""Called about 20 times per second during a wait. It raises to end the wait."""
+"""Function that is called about 20 times per second during a wait. It raises an error to end the wait."""
 
 
 class ProgramRefused(ConnectError):

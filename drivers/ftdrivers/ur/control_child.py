@@ -118,7 +118,7 @@ class Calls:
         return self._control.setTargetPayload(mass_kg, com_m, inertia_kg_m2)
 
     def set_gravity(self, up_base_m_s2: list[float]) -> bool:
-        """Set gravity; return whether that succeeded."""
+        """Set gravity in the controller; return whether that succeeded."""
         return self._control.setGravity(up_base_m_s2)
 
     def quit(self) -> None:
@@ -135,7 +135,7 @@ def _main() -> None:
     os.dup2(2, 1)  # the output of the C++ library must not mix with the replies
 
     def reply(**content: object) -> None:
-        with suppress(OSError):  # the parent has ended, and stdin will end too
+        with suppress(OSError):  # the parent has ended; reading stdin will show it
             replies.write(json.dumps(content) + "\n")
             replies.flush()
 
@@ -167,7 +167,7 @@ def serve(calls: Calls, requests: "SimpleQueue[str | None]", reply: Callable[...
         try:
             line = requests.get(timeout=unwatched_s if calls.moving else None)
         except Empty:
-            with suppress(Exception):  # if this fails, the parent stops the arm when it resumes
+            with suppress(Exception):  # if this stop fails, a suspended parent stops the arm when it resumes
                 calls.stop_unwatched()
             continue
         if line is None:

@@ -105,7 +105,7 @@ def path_for(setting: ControlSetting, version: tuple[int, ...]) -> tuple[Control
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """Takes control of one arm, which `reader` reads."""
+    """Takes control of the arm that `reader` reads: checks, then start of the control program."""
 
     host: str
     setting: ControlSetting
@@ -259,7 +259,7 @@ class Opening:
 
 
 def _refusal(host: str, path: ControlPath, error: DeviceError) -> ConnectError:
-    """Return the error of a control path that did not start, with a fix."""
+    """Return the error to raise if a control path did not start, with a fix."""
     return ConnectError(
         f"{path} cannot control {host}: {error.found}",
         "check on the pendant that it is in remote control, that no dialog is open, and that no other program starts "

@@ -128,7 +128,7 @@ class Reader:
         self._t_device_s = math.nan
         self._lateness, self._late_s = _Lateness(), 0.0
         self._followers: list[Unread[Received]] = []
-        # Time of the next check of a followed pose.
+        # Time at which the next pose of a follower is checked against the kinematics.
         self._check_s = -math.inf
         # Whether any pose has agreed with the kinematics of this arm.
         self._fits = False

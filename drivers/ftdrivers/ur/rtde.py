@@ -357,7 +357,7 @@ def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float, clo
 
 
 def registers_taken(host: str, names: Sequence[str]) -> ConnectError:
-    """Return the error for inputs that belong to another client. `names` may be incomplete."""
+    """Return the error to raise if RTDE inputs belong to another client; `names` may lack some of them."""
     which = f" ({names[0]} and {len(names) - 1} more)" if names else ""
     return ConnectError(
         f"another client controls {host} and holds its RTDE registers{which}",

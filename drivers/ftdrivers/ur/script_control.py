@@ -120,7 +120,7 @@ log = logging.getLogger(__name__)
 
 # In 400 trials the arm began to decelerate at most 0.23 s after the last heartbeat.
 STOPS_ITSELF_S: Final = 0.3
-"""Longest time from the last heartbeat to the start of the deceleration, s: 0.2 s and the cycles of both ends."""
+"""Longest time from the last heartbeat to the start of braking, s: 0.2 s plus cycles of controller and client."""
 _RATE_HZ: Final = 125.0
 _LOOK_OUT_S: Final = 0.05
 _LARGEST: Final = 2**31 - 1

@@ -88,7 +88,7 @@ class Deframer:
 
     @property
     def arrived(self) -> str:
-        """A phrase for error messages: which data have arrived so far."""
+        """Phrase for error messages that describes which data have arrived so far."""
         if self.number:
             return f"{self.number - self.damaged} frames arrived"
         return f"bytes arrived, but no frames of {self._size} bytes" if self.has_noise else "no bytes arrived"

@@ -187,7 +187,7 @@ class BotaBox(SerialSensor):
             self._execute(command[0])
 
     def _refuse_what_is_no_command(self) -> None:
-        """Keep the beginning of a command, and answer other bytes with an error."""
+        """Answer bytes that cannot begin a command with an error; keep the beginning of a command."""
         if self._line and (self._line[:1] not in b"cfp" or len(self._line) > LONGEST_COMMAND):
             self._answer(self._line[:1], error=1)
             self._line = b""

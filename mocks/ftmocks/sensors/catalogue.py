@@ -95,7 +95,7 @@ class Sensor:
         self.endpoint = self._endpoint(self._kind, emulator.start())
 
     def _endpoint(self, kind: Kind, where: Any) -> dict[str, Any]:
-        """Return the description that the station prints; the address is under "url"."""
+        """Return the description of the sensor that the station prints for clients; its address is under "url"."""
         if isinstance(where, dict):
             ports = "&".join(f"{key}={port}" for key, port in where.items() if key != "host")
             return {"url": f"{kind.scheme}://{where['host']}?{ports}", **where}

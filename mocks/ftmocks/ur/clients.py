@@ -42,7 +42,7 @@ class Client(ABC):
         return b""
 
     def on_cycle(self) -> None:
-        """Send the bytes of a control cycle and the waiting bytes."""
+        """Send what this port sends in each control cycle, and bytes that are still waiting."""
         self.flush()
 
     def on_ready(self) -> None:

@@ -56,7 +56,7 @@ _SINCE = {
     "is in remote control": {5: 6},
     "safetystatus": {3: 11, 5: 4},
 }
-"""First minor version with a command, by major version."""
+"""For each command, the first minor version of PolyScope that has it, by major version."""
 
 
 def _play(robot: Robot) -> str | None:

@@ -48,7 +48,7 @@ NO_WAY_ON = "the straight line leaves the workspace or meets a singularity"
 
 
 class MotionError(ValueError):
-    """The motion cannot be executed, which ends the program."""
+    """A requested motion cannot be executed, which ends the program."""
 
 
 class CannotFollow(Exception):
@@ -242,7 +242,7 @@ class Servo:
 
     @property
     def ahead_s(self) -> float:
-        """Time until the set-point reaches the last commanded target, s."""
+        """Time until the last commanded target is due, s."""
         return sum(command.seconds for command in self._commands) - self._into_s
 
     def command(self, command: Command) -> None:
@@ -550,7 +550,7 @@ class Arm:
         self.actual_qd = vector6([v + push for v, push in zip(qd, pushed, strict=True)])
 
     def _yielded(self, left: float) -> Vector6:
-        """Return the deflection of the joints after one cycle, rad."""
+        """Return the deflection of the joints by a push of the operator after one control cycle, rad."""
         before, goal = self._off_rad, self.pushed_rad
         after = vector6([g + (off - g) * left for off, g in zip(before, goal, strict=True)])
         return goal if max(abs(off - g) for off, g in zip(after, goal, strict=True)) < SETTLED_RAD else after

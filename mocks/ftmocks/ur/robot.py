@@ -42,11 +42,11 @@ PROGRAM_START_S = 0.1
 POWER_STEP_S = 0.5
 COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
 STOP_SCRIPT = 255
-"""Command in a register that ends the control script."""
+"""Command that ends the control script when a client writes it into a command register."""
 HAND_ACCELERATION_RAD_S2 = 1.5
 NO_ERROR: Array = np.zeros(6)
 INSTALLED_G_M_S2 = 9.82
-"""Gravitational acceleration in an installation, which does not depend on the place."""
+"""Gravitational acceleration that an installation contains, m/s², the same at every place on Earth."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ class Robot:
         self._reduced = False
         self._program: ControllerProgram | None = None
         self.wrist_sensor: Callable[[int], Array] | None = None
-        """Returns readings (n, 6) of a wrist sensor with bias and noise; if it is None, `ft_raw_wrench` is exact."""
+        """Returns n readings (n, 6) of the wrist sensor with bias and noise; without it, `ft_raw_wrench` is exact."""
         self._physical_s = self._stopped_at_s = self._watchdog_age_s = 0.0
         self._later: list[tuple[float, Callable[[], object]]] = []
         self._watchdog: tuple[str, float] | None = None

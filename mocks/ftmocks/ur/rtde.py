@@ -82,7 +82,7 @@ class Recipe:
         """Number of bytes of a payload after the recipe id."""
 
     def answer(self) -> bytes:
-        """Return the payload of the reply to the set-up request."""
+        """Return the payload of the reply to the set-up request for this recipe."""
         return bytes([self.recipe_id]) + ",".join(self.types).encode("ascii")
 
     def pack(self, values: Sequence[Value]) -> bytes:

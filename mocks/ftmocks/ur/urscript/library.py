@@ -341,7 +341,7 @@ def get_target_joint_speeds(program: Caller) -> list[float]:
 
 
 def get_tcp_offset(program: Caller) -> Pose:
-    """Return the active TCP in the flange frame."""
+    """Return the pose of the active TCP in the flange frame."""
     return Pose(program.robot.tcp_offset)
 
 
@@ -545,7 +545,7 @@ _SINCE = {
     "set_tool_output_mode": {3: _NEVER},
     "tool_contact": {3: _NEVER, 5: 4},
 }
-"""First minor version with a function, by major version."""
+"""For each function, the first minor version of PolyScope that has it, by major version."""
 
 
 def functions(polyscope: tuple[int, int, int]) -> Mapping[str, Built_in]:
