@@ -211,7 +211,7 @@ def _describe(
 def _add_test(
     compared: MethodResult, parameters: Parameters, test: CalibrationDataset, truth: Parameters
 ) -> MethodResult:
-    """Return a result with the columns of Table III added."""
+    """Return the result of a method with the columns of Yu's Table III added."""
     force, torque = np.split(test.wrench - predict(parameters, test.R_base_flange), 2, axis=1)
     largest = [np.abs(np.column_stack([part, np.linalg.norm(part, axis=1)])).max(axis=0) for part in (force, torque)]
     weight_N, true_N = parameters.weight_N, truth.weight_N

@@ -13,7 +13,7 @@ from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
-# Values that `json` can write: numbers, strings, None, and lists and dicts of these.
+# Type of values that `json` can write: numbers, strings, None, and lists and dicts of these.
 JSON: TypeAlias = Any
 # Largest file that is read as a whole: 200,000 poses with covariances.
 MOST_BYTES: Final = 200_000_000
@@ -100,7 +100,7 @@ def open_file(path: str | Path) -> BufferedReader:
     """Open a file for reading; raise `OSError` also for a pipe or a device, from which reading may never end."""
     path = Path(path)
     mode = path.stat().st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # for a folder, `open` raises a clear error
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # a folder is left to `open`, whose error is clear
         raise OSError(f"{path} is a pipe or a device: save its content in a file, and give that file")
     return path.open("rb")
 

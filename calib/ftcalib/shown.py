@@ -111,7 +111,7 @@ def data_frame(columns: Mapping[str, ArrayLike]) -> Any:
         try:
             return import_module(name).DataFrame(dict(columns))
         except ModuleNotFoundError as error:
-            if error.name != name:  # the package is installed, but one of its dependencies is not
+            if error.name != name:  # re-raised: the package is installed, but a dependency is missing
                 raise
     raise UsageError("a DataFrame needs pandas or Polars, but neither is installed: run pip install pandas")
 

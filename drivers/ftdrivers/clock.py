@@ -34,7 +34,7 @@ class Clock(ABC):
     poll_s = 0.05
     """Longest time for which one read may block, s of real time. The time of an emulated cell stops meanwhile."""
     lead_s = 0.0
-    """Largest lag of a device behind this clock, s: an emulator in another process may get no CPU time."""
+    """Largest lag of a device's clock behind this clock, s: an emulator in another process may get no CPU time."""
     can_be_held = False
     """Whether the time of this clock stops during a `held` block."""
 

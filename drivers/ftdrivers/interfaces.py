@@ -436,7 +436,7 @@ class RobotArm(_Device):
         raise DeviceFault(f"the driver of this arm cannot set {payload}", "set it at the controller")
 
     def set_gravity(self, up_base_m_s2: Sequence[float]) -> None:
-        """Set gravity in the controller, see `ControllerSettings`. Needs control. The base method raises `DeviceFault`."""
+        """Set gravity in the controller, see `ControllerSettings`. Needs control. Here, it raises `DeviceFault`."""
         gravity = f"a gravity of {[*up_base_m_s2]} m/s²"
         raise DeviceFault(f"the driver of this arm cannot set {gravity}", "set the mounting at the controller")
 

@@ -14,7 +14,7 @@ from ftcalib.model import Array, Parameters, read_only
 
 # A standard deviation below this share of the largest is a rounding error: the value was exactly known.
 _KNOWN = 1e-9
-# An eigenvalue of a correlation matrix below this limit is a rounding error.
+# Eigenvalues of a correlation matrix below this share of the largest are rounding errors.
 _SINGULAR = 1e-10
 # Smallest significant difference along a direction that both calibrations take as exactly known.
 _ROUNDING_SIGMAS = 1e-3

@@ -53,7 +53,7 @@ class Update(Calibrated):
     chi2: float
     """Chi2 of the new readings; about `dof` if they agree with noise and previous uncertainty."""
     dof: int
-    """Degrees of freedom; 0 if no reading is left for a check."""
+    """Degrees of freedom of `chi2`; 0 if no reading is left for a check."""
     kind: str = ""
     """Kind of update, a key of `BLOCKS`."""
     residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))

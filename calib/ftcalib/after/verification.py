@@ -75,7 +75,7 @@ _USUAL_SMOOTH = np.geomspace(0.15, 2, 3)
 _OTHER_JOINTS = 0.8
 # If the fit cannot, errors at other joint angles: variance relative to that in the fit, and to that of a usual arm.
 _BEYOND, _LEAST_BEYOND = 2.0, np.array([1.0, 0.0])
-# Largest number of poses of the fit from which smooth errors are estimated.
+# Largest number of poses of the fit for which smooth errors are estimated.
 _FEW_TO_SMOOTH = 100
 # Smallest factor of the measured noise: readings of a coarse sensor may agree much better than their stated noise.
 _LEAST_FACTOR = 0.1
@@ -110,7 +110,7 @@ class Expected:
         return residual, np.sqrt(self.factor * np.diag(S)).reshape(residual.shape), chi2
 
     def common(self, R_base_flange: Array) -> Array:
-        """Return the covariance (6n, 6n) of the predictions due to the calibration, without `factor`."""
+        """Return the covariance (6n, 6n) of the predictions due to errors of the calibration, without `factor`."""
         K = self.calibration.jacobian(R_base_flange).reshape(6 * len(R_base_flange), -1)
         return np.asarray(K @ self.calibration.joint_covariance @ K.T)
 
@@ -448,7 +448,7 @@ def _explain_alarm(
         least, update = found[single[0]]
         change = _SINGLE[single[0]]
         blocks = set(BLOCKS[single[0]])
-        # Changes that include each other, such as payload and weight, are not alternatives.
+        # Of two changes where one includes the other, such as payload and weight, neither is an alternative.
         apart = [kind for kind in single if not (blocks <= set(BLOCKS[kind]) or blocks >= set(BLOCKS[kind]))]
         others = tuple(dict.fromkeys(_SINGLE[kind] for kind in apart if found[kind][0] < least + _INDISTINCT))
         reason = f"{_describe_update(calibration, update)} ({misfit}, {update.chi2:.0f} after the update)"

@@ -42,7 +42,7 @@ from ftcalib.sensor_matrix import (
 REACH_M = 0.1
 # False-alarm probability of the test for a fault.
 FALSE_ALARMS = 1e-5
-# Number of sigmas above which a mass counts as different from zero.
+# Number of sigmas above which a weighed mass counts as different from zero.
 LEAST_SIGMAS = 4.0
 # Usual drift of a bias, one standard deviation, N/h and N·m/h: warm sensors drift less.
 _DRIFT_PER_H = np.repeat([5.0, 0.15], 3)
@@ -223,7 +223,7 @@ def weigh_load(  # noqa: PLR0913 - readings, noise and prior knowledge
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LoadFit:
-    """Least-squares estimate of mass and mass times centre of mass."""
+    """Least-squares estimate of mass, and mass times centre of mass, of a held part."""
 
     x: Array
     """(4,) mass and mass times centre of mass, kg and kg·m."""
@@ -231,9 +231,9 @@ class _LoadFit:
     S: Array
     """(6n, 6n) covariance of the readings of all n poses."""
     H: Array
-    """(6n, 4) derivative of the readings with respect to `x`."""
+    """(6n, 4) derivative of the readings with respect to the estimates `x`."""
     near: Array
-    """(3, 4) prior of the centre of mass, in standard deviations."""
+    """(3, 4) rows of the prior of the centre of mass, divided by its standard deviation."""
     misfit: Array
     """(6n,) residuals of the readings after the fit."""
 
@@ -254,7 +254,7 @@ def _fit_load(left: Array, A: Array, covariance_of: Callable[[Array], Array], p_
             x[1:], sigma_kg = x[0] * p_sensor_near_m, float(1 / np.sqrt(a @ W @ a))
             continue
         W = np.linalg.inv(S)
-        # The prior of the moment m p is proportional to the mass, with at least one sigma of the mass.
+        # The prior sigma of the moment m p is the reach times the mass, or times its sigma if that is larger.
         near = np.column_stack([-p_sensor_near_m, np.eye(3)]) / (REACH_M * max(abs(x[0]), sigma_kg))
         H = A.reshape(6 * n, 4)
         covariance = np.linalg.inv(H.T @ W @ H + near.T @ near)

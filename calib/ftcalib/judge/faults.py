@@ -32,7 +32,7 @@ EQUAL = 0.1
 COLLAPSE = 0.4
 # The correction of a mistake in force or torque must not increase the residual of the other by more than this factor.
 NO_WORSE = 1.2
-# Largest force residual after a correction, as a share of the weight.
+# After the correction of a mistake, the force residual must be below this share of the weight.
 CORRECTED = 0.1
 # Penalty, in the logarithm of the residuals, of a weight that pulls sideways, and of a tool inside the flange.
 IMPLAUSIBLE = 1.0

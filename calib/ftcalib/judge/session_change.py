@@ -99,7 +99,7 @@ class SessionChange:
 
     @property
     def starts(self) -> NDArray[np.intp]:
-        """Indices of the first pose after each change."""
+        """Indices of the first row after each change."""
         return np.flatnonzero(np.diff(self.rows)) + 1
 
     @property
@@ -237,7 +237,7 @@ def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
         return np.asarray(3 * np.maximum(np.linalg.eigvalsh(left)[:, 0], 0.0) / (3 * (n - steps - 1) - _SHAPE) + finest)
 
     def with_another(beam: Sequence[Steps]) -> dict[Steps, float]:
-        """Return the mean square force residual of each set of steps, extended by each possible further step."""
+        """Return the mean square force residual for each set of bias steps, after each possible further step."""
         bounds, added = np.array([[0, *others, n] for others in beam]), dict[Steps, tuple[int, int]]()
         for i, own in enumerate(bounds.tolist()):
             for first, last in pairwise(own):

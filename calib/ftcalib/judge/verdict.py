@@ -54,7 +54,7 @@ ENOUGH_FOR_FAULTS, SUCCESSIVE = 2000, 100
 # False-alarm probability of a finding.
 SURE = 1e-3
 
-# Assumed interval between poses if their times are unknown.
+# Assumed interval between poses, s, if their times are unknown.
 USUAL_INTERVAL_S = 10.0
 # Assumed time from the last pose of a tour to the next use of its calibration.
 NEXT_USE_S = 60.0
@@ -137,7 +137,7 @@ class Quality:
     suspect: bool
     """Whether there are large errors, rejected poses or cross-talk that a mistake in the data may have caused."""
     residual_sigma: Array
-    """(n,) leave-one-out residual of each pose in sigma, rms over the channels: 1 expected."""
+    """(n,) leave-one-out residual of each pose in standard deviations, rms over the six channels; 1 is expected."""
     worst_pose: int
     """Row, counted from 0, of the used pose with the largest leave-one-out residual."""
     lag1: float
@@ -153,7 +153,7 @@ class Quality:
     loo_torque_rms_Nm: float
     """Leave-one-out rms error of torque over the used poses, N·m."""
     ahead: DriftAhead
-    """Drift from the last pose to the next use."""
+    """Expected drift of the bias from the last pose to the next use."""
     noise_factor: float | None
     """Ratio of residuals to measured noise; None if the noise was not measured."""
     chi2_p: float | None

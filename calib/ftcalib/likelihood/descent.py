@@ -190,7 +190,7 @@ class Descent:
         common = len(weights) == 1 or weights.strides[0] == 0
         separate = _without_correlation(weights[:1] if common else weights)
         if common and n > CHUNK:
-            # Sums about a mean keep the digits that a large bias would cost.
+            # Sums of differences from a mean keep the digits that a large bias would cost.
             reference[:, 9] = self.wrench[:CHUNK].mean(axis=0)
             gram = wrench_gram(self.R, self.wrench, reference)
             rows = [0, 1, 2, *range(6, 16)]
@@ -223,7 +223,7 @@ class Descent:
 
     @staticmethod
     def same(p: Parameters, q: Parameters) -> bool:
-        """Whether two points belong to the same minimum: their mountings differ by less than 1°."""
+        """Whether two parameter sets belong to the same minimum: their mountings differ by less than 1°."""
         return bool(angle_between(p.R_flange_sensor, q.R_flange_sensor) <= SAME_ROTATION_RAD)
 
     def normal_equations(self, statistics: Statistics, p: Parameters) -> tuple[Array, Array, float]:

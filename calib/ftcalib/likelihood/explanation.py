@@ -145,7 +145,7 @@ def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Co
 
 
 def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
-    """Return the likelier of the model and one with linear drifts instead of the random walks of the same groups."""
+    """Return the likelier of two models: the given one, and one with linear drifts instead of its random walks."""
     walks = [k for k, c in enumerate(best.components) if c.kind == "walk"]
     if not walks:
         return best
@@ -167,7 +167,7 @@ def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
 
 
 def _better(problem: Linearised, best: Point, components: Sequence[Component], theta: Array, needed: int) -> Point:
-    """Return the better of the model and one with other components, by penalised log-likelihood."""
+    """Return the better of two models, `best` and one with other `components`, by penalised log-likelihood."""
     trial = maximise(problem, components, theta, best.worth)
     if trial.loglik > best.worth:
         trial = _prune(problem, trial, needed)
@@ -287,7 +287,7 @@ SUSPICIOUS = 0.01
 LIGHT_TAIL = 0.6
 # Largest number of iterations of each loop of the search.
 ROUNDS = 20
-# Convergence: squared step, in standard deviations of the estimates.
+# Convergence of the search: squared step of the estimates, in their standard deviations.
 SETTLED = 1e-4
 # A minimum whose chi2 is larger by more than this than the lowest is excluded, whatever the noise model.
 FAR = 1000.0
@@ -404,7 +404,7 @@ def _is_quiet(session: SessionData, best: Minimum) -> bool:
     if best.chi2 > float(chi2_isf(session.dof(session.everything), SUSPICIOUS)):
         return False
     if session.n > MANY_POSES and session.drift == "none":
-        return True  # an outlier that matters among so many poses would increase chi2
+        return True  # among so many poses, an outlier that matters would increase chi2
     problem = session.linearise(best.parameters, session.everything)
     at = maximise(problem, (), np.zeros(0))
     if _stand_out(session, squared_length(*at.left_out())):
@@ -468,7 +468,7 @@ def _improve_once(
     criterion = _criterion(session, at, distances)
     if not criterion < best.criterion - 1e-3:
         return best, p, problem, at, False
-    # Many poses with Gaussian residuals contain no hidden outliers.
+    # If many poses have Gaussian residuals, no outliers are hidden among them.
     if kept.all() and _are_gaussian(session, distances):
         return Explanation(p, kept, at.components, at.theta, criterion, noise=at.noise), p, problem, at, True
     noise_found = {"white", "rotation"} & {c.kind for c in at.components[needed:]}
@@ -522,7 +522,7 @@ def _criterion(session: SessionData, at: Point, distances: Array) -> float:
 
 
 def _with_all_minima(session: SessionData, e: Explanation, others: list[Minimum]) -> list[Minimum]:
-    """Return all minima under the noise model of the explanation."""
+    """Return all minima of the joint cost under the noise model of the explanation."""
     noise = noise_under(session, e, e.parameters)
     statistics, logdet = session.statistics(noise, e.parameters), noise.logdet
     ends = [

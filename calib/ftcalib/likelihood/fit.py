@@ -64,7 +64,7 @@ class Estimate(Calibrated):
     free: Array
     """(15, m) orthonormal basis of the directions that are not exactly known; the identity without a `Known`."""
     noise: Noise
-    """Covariance of all wrenches under the noise model; in a `Fit` the poses are sorted by `order`."""
+    """Covariance of all wrenches under the noise model; in a `Fit` its poses are sorted by time, see `order`."""
     R_base_flange: Array
     """(n, 3, 3) orientations of the flange."""
     wrench: Array
@@ -299,7 +299,7 @@ def fit(
     )
     e, minima, static_chi2 = explain(session)
     has_structure = any(c in STRUCTURE for c in e.components)
-    # Structured errors can explain wrong data so well that no weight remains.
+    # Structured errors can explain wrong data so well that no weight of the tool remains.
     best = _fit_of(session, e, minima, static_chi2) if minima[0].settled or not session.structure() else None
     if best is not None and not (has_structure and session.n <= STRUCTURED_POSES):
         return best
@@ -362,7 +362,7 @@ def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_
     if session.measured and found.keys() & {*RESPONSE}:
         of_sensor = [c for c in e.components if c in RESPONSE]
         measured_chi2 = point(problem, of_sensor, np.array([found[c] for c in of_sensor])).chi2
-    # Many poses determine the variances so well that their uncertainty is negligible.
+    # With many poses the uncertainty of the variances is negligible.
     parameters = best.parameters
     if drifts or found.keys() & {*RESPONSE, *UNCOMPENSATED} or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
         x, C = estimates_of_unknown_variances(at)

@@ -60,7 +60,7 @@ POSES_FOR_EACH_AXIS = 50
 EXACT = 100
 # Constant of the low-discrepancy sequence with which a subset of the poses is selected.
 GOLDEN_RATIO = (1 + 5**0.5) / 2
-# Smallest assumed ratio of force to torque residuals or the reverse, in units of their usual ratio.
+# Neither force nor torque residuals are assumed smaller than this share of what the usual ratio to the other gives.
 UNEQUAL = 0.01
 # Smallest white noise, as a share of the residuals, if the noise was not measured.
 FLOOR = 1e-3

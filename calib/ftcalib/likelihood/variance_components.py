@@ -105,7 +105,7 @@ class Linearised:
     """Estimation problem of one session, linearised at given parameters, without the variances."""
 
     J: Array
-    """(n, 6, m) derivative of the wrench with respect to the free parameters."""
+    """(n, 6, m) derivative of the predicted wrench with respect to the free parameters."""
     r: Array
     """(n, 6) residuals at the point of linearisation, N and N·m."""
     prior: tuple[Array, Array]
@@ -220,7 +220,7 @@ class Point:
 
     @property
     def too_large(self) -> bool:
-        """Whether any variance is at its upper bound."""
+        """Whether any variance has reached its upper bound, so the model is not plausible."""
         return any(v >= self.problem.largest(c) for c, v in zip(self.components, self.theta, strict=True))
 
     @property
@@ -525,7 +525,7 @@ def estimates_of_unknown_variances(at: Point) -> tuple[Array, Array]:
     x, C = parameter_estimates(at)
     if not at.components or len(at.problem.r) >= POSES_THAT_SHOW_THE_NOISE:
         return x, C
-    # A variance at its assumed lower bound is treated as known.
+    # A variance that is at its assumed lower bound is treated as known exactly.
     free = np.flatnonzero(at.theta > 1.001 * np.array([at.problem.smallest(c) for c in at.components]))
     if not free.size:
         return x, C

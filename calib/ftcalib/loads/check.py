@@ -17,7 +17,7 @@ _WITHIN = 2.0
 
 
 class LoadCheck(NamedTuple):
-    """Result of a check with a known weight."""
+    """Result of the check of a sensor with a known weight on a string."""
 
     read_N: float
     """Measured force along gravity, mean over the poses, N."""
@@ -25,7 +25,7 @@ class LoadCheck(NamedTuple):
     scale_error: float
     """Relative error of the measured force: `read_N` / `expected_N` - 1."""
     scale_sigma: float
-    """Standard deviation of `scale_error` without errors of the sensor."""
+    """Standard deviation of `scale_error` from noise, drift and calibration, without errors of the sensor."""
     promised_sigma: float
     """Relative standard deviation of the sensor at this load, according to its declared or known accuracy."""
     off_vertical_rad: float

@@ -37,9 +37,9 @@ _CONTACT = float(chi2_isf(6, 1e-7))
 TOUCH_N, TOUCH_NM = 2.0, 0.2
 # Share of the rows of each state of motion, those with the smallest residuals, that are assumed to have no contact.
 QUIET = 0.4
-# Largest share of rows in contact; beyond it the model does not fit at all.
+# Largest share of rows in contact; if there are more, the model itself does not fit.
 _MOST_CONTACT = 0.8
-# Rows left out on both sides of a contact, because the filter spreads the contact.
+# Number of rows left out on both sides of a contact, because the filter spreads the contact.
 _MARGIN = 2
 # A component of the noise model is kept if it lowers -2 log restricted likelihood by at least this much.
 _WORTH = 4.0
@@ -78,7 +78,7 @@ LIMIT = 22.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionFit:
-    """Best fit of a load to the rows of a motion."""
+    """Best fit of a moving load to the rows of a recording."""
 
     load: MovingLoad
     covariance: Array

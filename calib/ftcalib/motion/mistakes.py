@@ -47,16 +47,16 @@ _FAR_ASIDE_M: Final = 0.03
 # Largest and smallest plausible height of the sensor origin above the flange.
 _HIGHEST_M: Final = 0.5
 _LOWEST_M: Final = -5e-3
-# Height from which a reference point of the torques beyond the centre of mass is taken for a TCP.
+# A reference point of the torques beyond the centre of mass is taken for a TCP from this height above the flange, m.
 _TCP_M: Final = 0.1
 # Tolerance of negative second moments of mass: 3 sigma plus the mass times the square of this radius of gyration.
 _GYRATION_M: Final = 0.01
-# Number of 10 ms means averaged on each side of a step, and number within the step.
+# Number of 10 ms means that are averaged on each side of a step of the readings, and number within the step.
 _BESIDE, _WITHIN = 5, 1
 # A step is a zeroing if it reduces the readings to this share, is this many times the usual change among so many means
 # around it, and is at least this force (N).
 _ZERO_SHARE, _STEPS, _AROUND, _LEAST_STEP_N = 0.25, 4.0, 101, 1.0
-# Share of a step of the reading that must be a step of the bias. A contact that ends leaves no step of the bias.
+# A zeroing must step the bias by this share of the step of the reading; the end of a contact does not step the bias.
 _STAYS: Final = 0.6
 # Indices of the sensor's position (lateral offset, height) in the covariance of a `FreeFit`.
 _POINT: Final = np.r_[SIZE + 1, SIZE + 2, HEIGHT]
@@ -78,7 +78,7 @@ def unchanged(rows: MotionRows) -> MotionRows:
 
 
 Stream = tuple[Array, Array]
-"""Times (n,) and values (n, k) of a recorded stream."""
+"""Times (n,), s, and values (n, k) of a recorded stream of wrenches or poses."""
 
 
 # ------------------------------------------------------------------------------------------------------------- zeroing
@@ -182,7 +182,7 @@ def find_motion_mistakes(rows: MotionRows, free: FreeFit, spread_m: float) -> tu
     to_com, com = signs[0] * (np.append(free.error.aside_m, load.height_m) + seen) / turning, signs.prod() * seen
     of_com = np.sqrt(np.diag(Q @ free.covariance[9:12, 9:12] @ Q.T))
     are_signed = abs(moment) > _SIGNED * sigma_moment and fitted > _SIGNED * sigma_scale
-    # The centre of mass must lie behind the sensor rather than beside it.
+    # Counts only if the centre of mass lies behind the sensor rather than beside it.
     behind_m = max(INSIDE_M, SIGNIFICANT_SIGMAS * of_com[2], float(np.linalg.norm(com[:2])))
     behind = are_signed and bool(-com[2] > behind_m)
     other = _other_point(to_com, com, sigma[_POINT] / turning, behind=behind, upright=bool(Q[2, 2] > 0))

@@ -175,13 +175,13 @@ class SmoothFunctions:
     R_base_flange: Array
     """(m, 3, 3) orientations of the kernel matrix."""
     weights: Array
-    """(m, k) weights of these orientations in each component."""
+    """(m, k) weights of the orientations `R_base_flange` in each component."""
     mean: Array
     """(m,) mean of the kernel over the recording, which is subtracted before the weights are applied."""
 
     @classmethod
     def of(cls, R_base_flange: Array) -> Self:
-        """Return the components for the orientations (n, 3, 3) of a recording."""
+        """Return the principal components for the orientations (n, 3, 3) of a recording."""
         at = R_base_flange[:: -(-len(R_base_flange) // _RESTING_ON)]
         correlated = alike(at, at)
         centred = correlated - correlated.mean(axis=0)

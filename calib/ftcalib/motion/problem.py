@@ -143,13 +143,13 @@ class Problem:
         of_turns = start + 6 * len(slow) + np.arange(turns)
         groups["yielding_rad"] = of_turns[-12:-3], np.eye(9)
         groups["rotation_rad"] = np.append(of_turns[:-12], of_turns[-3:]), np.eye(turns - 9)
-        # An antisymmetric entry has half the variance of an entry.
+        # An entry of the antisymmetric part has half the variance of a full entry.
         precision = np.diag(np.append(np.ones(CROSS_TALK.stop - CROSS_TALK.start), np.full(3, 2 / RANGE_LEVER_M**2)))
         groups["cross_talk"] = np.append(np.arange(SIZE)[CROSS_TALK], at + np.arange(3)), precision
         return groups, at + 3 - start
 
     def residuals(self, load: MovingLoad, effects: Array) -> Array:
-        """Return the measured wrenches (n, 6) of all rows minus the prediction of load and effects."""
+        """Return the measured wrenches (n, 6) of all rows minus those predicted from load and random effects."""
         rows, others = self.rows, effects[6 * self.courses :]
         wrench = self.hats(rows.t_s) @ self.drift(effects)
         if others.any():
@@ -377,7 +377,7 @@ class Problem:
         P, on, _ = self.components({**sizes, name: 0.0}, load)
         value = np.concatenate([load.vector, self.basis.T @ effects])
         rows, residuals = self.constraints.measurements(load.static)
-        # Linearised at the current load, with all effects 0.
+        # The model is linearised at the current load, with all random effects 0.
         value[:15] = 0.0
         b, H = b + H @ value, H + P
         H[:15, :15] += rows.T @ rows
@@ -401,9 +401,9 @@ class Solution:
     """Solution of the normal equations for load and effects."""
 
     step: Array
-    """(34 + effects,) step of load and effects."""
+    """(34 + effects,) step of the load's coordinates and of the random effects."""
     cost: float
-    """Chi2 of rows and priors after the step."""
+    """Chi2 of rows and priors, as predicted for the load after the step."""
     criterion: float
     """-2 log restricted likelihood of the standard deviations of the components, up to a constant."""
     basis: Array

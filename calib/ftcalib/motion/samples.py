@@ -87,7 +87,7 @@ class SampleClock:
 
     def __init__(self, period_s: float = 1.0, tolerance: float = CLOCK_TOLERANCE) -> None:
         self.shift_s = 0.0
-        """Offset subtracted from every time, s; a change takes effect gradually."""
+        """Offset that is subtracted from every time stamp, s; a change takes effect gradually."""
         self._nominal_ns = period_s * 1e9
         self._tolerance = tolerance
         self.restart()
@@ -324,7 +324,7 @@ class MotionRows:
     """(n, 6) filtered wrench in the sensor frame, N and N·m."""
     motion: Motion
     rate: Motion
-    """Rate of change of the motion, per second."""
+    """Rate of change of the 21 numbers of `motion`, per second."""
     speed_rad_s: Array
     """(n,) angular speed, plus the speed of the flange origin divided by 0.5 m."""
     delay_s: float

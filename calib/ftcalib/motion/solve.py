@@ -279,7 +279,7 @@ def _coarse_delay(rows: MotionRows) -> tuple[float, float]:
 
 
 def _select_rows(rows: MotionRows, limit_rad_s: float) -> MotionRows:
-    """Return the rows slower than a limit; raise if they are too few."""
+    """Return the rows slower than a limit; raise `NotObservable` or `BadDataset` if they last less than 5 s."""
     if np.isinf(limit_rad_s):
         return rows
     slow = rows[rows.speed_rad_s < limit_rad_s]

@@ -179,7 +179,7 @@ class AtiCanSensor(StreamingSensor):
         except (DeviceTimeout, ProtocolError):
             self._lost += 1
             self._missed += 1
-            self._await_quiet()  # a late half must not be paired with the next reading
+            self._await_quiet()  # so that a late half is not paired with the next reading
             if self._missed > 1:
                 self._select_slot()  # if the sensor has restarted, slot 0 is selected
             return NOTHING

@@ -29,7 +29,7 @@ from ftdrivers.wires.serial_port import SerialPort, SerialProbe
 log = logging.getLogger(__name__)
 
 _BAUD = 1_250_000
-# Time-out of one read, s, and the silence after which a stream has stopped.
+# Time-out of one read, s, and the silence, s, after which the stream counts as stopped.
 _READ_S = 0.02
 _REPLY_S = 0.1
 _SILENCE_S = 0.2
@@ -196,7 +196,7 @@ class AtiSerialSensor(StreamingSensor):
             self._port.close()
 
     def _stop_stream(self) -> int:
-        """Stop the stream and return the status word, whose reply shows that the stream has stopped."""
+        """Stop the stream and read the status word; the reply to this request shows that the stream has stopped."""
         self._jam()
         try:
             return int.from_bytes(self._ask(modbus.read_registers(modbus.STATUS, 1), self._jam), "big")
@@ -204,7 +204,7 @@ class AtiSerialSensor(StreamingSensor):
             raise DeviceTimeout(exc.found, f"{exc.fix}, check termination and address") from exc
 
     def _start_stream(self) -> None:
-        self._ask(modbus.START, self._jam)  # if only the reply was lost, the stream is already running
+        self._ask(modbus.START, self._jam)  # the stream runs already if only the reply was lost
         self._buffer.clear()
         self._damaged.clear()
 

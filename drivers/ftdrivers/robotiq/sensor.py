@@ -151,7 +151,7 @@ def _host_and_port(address: str) -> tuple[str, int | None]:
 
 _BAUD = 19_200
 _REPLY_S = 0.2
-# Silence after which a stream has stopped, and the time-out for it, s.
+# Silence after which the stream counts as stopped, and the time-out for stopping it, s.
 _SILENCE_S, _STOP_S = 0.05, 1.0
 # Rates around 62.5 Hz, at which an FTDI adapter with a latency timer of 16 ms delivers data.
 _LATENT_RATE_Hz = (55.0, 70.0)

@@ -18,7 +18,7 @@ from ftdrivers.wires.framing import ENOUGH_FRAMES
 
 # Silence between two fields, s, at most half a period. The halves of one field follow each other directly.
 _SILENCE_S = 0.002
-# Largest relative deviation of the rate: manual and the vendor's header file differ by 0.1 for one rate.
+# Largest relative deviation of a sensor's rate: manual and the vendor's header file differ by 0.1 for one rate.
 _DRIFT = 0.12
 # Fraction of a sample period by which the last field may be late if all fields have arrived.
 _LATE = 0.5
@@ -106,7 +106,7 @@ class Halves:
         """Return whether all fields have arrived that are due since the clock was set."""
         if self._clock_ns is None:
             return True
-        # more fields than due show that the clock was set too late
+        # more fields than due mean that the clock was set too late
         due_ns = (len(self._waiting) + _LATE) * self._period_ns + self._late_ns
         return self._waiting[-1].t_host_ns - self._clock_ns < due_ns
 

@@ -212,7 +212,7 @@ class Transforms:
     def __init__(self, base: str, flange: str) -> None:
         self._base, self._flange = base, flange
         self.topics = {"/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage"}
-        # Keys are child frames; values are parent, time (None if static), orientation and origin.
+        # Newest transforms by child frame: parent, time (None if static), orientation and origin.
         self._parts: dict[str, tuple[str, int | None, Array, Array]] = {}
         self._last_ns = 0
 

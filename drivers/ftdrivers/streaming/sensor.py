@@ -284,7 +284,7 @@ class StreamingSensor(ForceTorqueSensor):
 
     @contextmanager
     def _tap(self) -> Iterator[Unread[FtSamples]]:
-        """Yield a queue that receives every sample from now on."""
+        """Yield a queue (`Unread`) that receives every sample from now on."""
         unread: Unread[FtSamples] = Unread(self.name, self._max_unread_samples)
         with self._news:
             self._check()
@@ -339,7 +339,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._arrivals.clear()
         self._received = self._duplicated = self._out_of_order = self._silences = self._reconnects = 0
         self._earlier_lost = self._earlier_malformed = 0
-        # Counters since the last `_connect`, which a subclass increments or assigns.
+        # Counters of lost samples and damaged frames since the last `_connect`; a subclass increments or assigns them.
         self._lost = self._malformed = 0
         self._events: deque[tuple[int, str]] = deque(maxlen=_EVENTS)
         self._rate = Rate(self.name, self._rate_fix)
@@ -486,7 +486,7 @@ class StreamingSensor(ForceTorqueSensor):
                 self._arrivals.popleft()
             self._newest, self._newest_ns = block if len(block) == 1 else block.rows(slice(-1, None)), t_ns
             if self._failure is not None:
-                # an interruption ends with a sample, not with a reply of the device
+                # an interruption ends with the first sample, not with a reply of the device
                 self._failure = self._interruption = None
                 self._reconnects += 1
                 self._note("reconnected")
@@ -527,7 +527,7 @@ class StreamingSensor(ForceTorqueSensor):
         return block.rows(fresh)
 
     def _not_opened(self, error: DeviceError) -> ConnectError:
-        """Return the error as `ConnectError` that begins with the name of the device."""
+        """Return an error of `open` as a `ConnectError` that begins with the name of the device."""
         found = error.found if error.found.startswith(self.name) else f"{self.name}: {error.found}"
         return ConnectError(found, error.fix)
 

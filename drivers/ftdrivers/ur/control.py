@@ -77,5 +77,5 @@ class Control(ABC):
         return None
 
     def explained(self, error: DeviceError) -> DeviceError:
-        """Return the error of a lost controller, completed by what the arm does in this case."""
+        """Return the error of a lost controller, completed by a sentence about what the arm does in this case."""
         return error

@@ -77,7 +77,7 @@ class Calls:
     def progress(self) -> tuple[bool, bool]:
         """Return whether the move has ended, and whether it was stopped because the parent did not watch it."""
         progress = self._control.getAsyncOperationProgressEx()
-        if not self._control.isConnected():  # a lost connection would look like an arrival
+        if not self._control.isConnected():  # without this check, a lost connection would look like an arrival
             raise RuntimeError("the control connection was lost")
         ended = progress.operationId() != self._before and not progress.isAsyncOperationRunning()
         self.moving = self.moving and not ended
@@ -176,12 +176,12 @@ def serve(calls: Calls, requests: "SimpleQueue[str | None]", reply: Callable[...
         call = cast(Callable[..., object], getattr(calls, request["call"]))
         try:
             reply(id=request["id"], value=call(*request["args"]))
-        except Exception as error:  # the library raises any exception; the parent handles it
+        except Exception as error:  # the library may raise any exception; the parent handles it
             reply(id=request["id"], error=str(error))
 
 
 def _listen(requests: "SimpleQueue[str | None]", leaving_s: float) -> None:
-    # After the parent was killed, stdin ends, and the control script is ended within 0.5 s.
+    # If the parent was killed, stdin ends, and this ends the control script within 0.5 s.
     for line in sys.stdin:
         requests.put(line)
     signal.setitimer(signal.ITIMER_REAL, leaving_s)

@@ -93,7 +93,7 @@ _LOCAL_X: Final = "set Control mode to Remote in the Safety overview of the pend
 
 def path_for(setting: ControlSetting, version: tuple[int, ...]) -> tuple[ControlPath, str]:
     """Return the control path and the reason for the choice."""
-    # ur-rtde needs a dashboard server, which PolyScope X does not have.
+    # The path ur-rtde needs a dashboard server, which PolyScope X does not have.
     if setting != "auto":
         return setting, "as configured"
     if version[0] >= POLYSCOPE_X:

@@ -130,7 +130,7 @@ class Reader:
         self._followers: list[Unread[Received]] = []
         # Time at which the next pose of a follower is checked against the kinematics.
         self._check_s = -math.inf
-        # Whether any pose has agreed with the kinematics of this arm.
+        # Whether any flange pose has agreed with the kinematics of this arm so far.
         self._fits = False
         self._failure: DeviceError | None = None
         self.silent = False
@@ -157,7 +157,7 @@ class Reader:
 
     @cached_property
     def kinematics(self) -> Kinematics | None:
-        """The kinematics that the controller sends, or None."""
+        """The measured kinematics that the controller sends; None if it sends none."""
         return kinematics_of(self.info)
 
     def close(self) -> None:

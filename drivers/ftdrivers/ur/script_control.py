@@ -67,7 +67,7 @@ _NO_HEARTBEAT: Final = -2
 
 @dataclass(frozen=True, slots=True)
 class _Report:
-    """The content of the output registers of the program."""
+    """Content of the output registers of the control program."""
 
     token: int = 0
     state: int = 0
@@ -311,7 +311,7 @@ class ScriptControl(Control):
             return self._fail(str(error))
         t_device_s, *numbers = (column[-1].item() for column in outputs.values())
         if t_device_s == self._t_device_s:
-            return self._pause()  # a repeated sample does not show that the controller runs
+            return self._pause()  # a repeated sample is no sign that the controller runs
         self._t_device_s, self._silent_s, self._heard_s = t_device_s, 0.0, self._clock.now_s()
         with self._changed:
             if self._killed:

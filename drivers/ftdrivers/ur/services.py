@@ -101,7 +101,7 @@ class _RobotApi:
         return self._value("/system/v1/information", "robotType")
 
     def serial(self) -> str | None:
-        # Reported since 10.14; the control mode since 10.12.
+        # PolyScope X reports these since 10.14, the control mode since 10.12.
         return self._value("/system/v1/information", "serialNumber")
 
     def polyscope(self) -> str | None:
@@ -124,7 +124,7 @@ class _RobotApi:
         return value if isinstance(value, str) and value else None
 
     def _request(self, method: str, path: str, content: dict[str, str] | None = None) -> Any:
-        """Return the answer, or None if this version does not have the path."""
+        """Send an HTTP request and return the answer; None if this version of the Robot API lacks the path."""
         body = None if content is None else json.dumps(content)
         try:
             self._connection.request(method, _PATH + path, body, {"Content-Type": "application/json"})

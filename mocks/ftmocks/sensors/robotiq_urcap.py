@@ -104,7 +104,7 @@ class RobotiqUrcap(Device[bytes]):
 
 
 def _sent(client: socket.socket, rest: bytes, frame: bytes) -> bytes:
-    """Send the rest of the last reading, then a new one; return the bytes that were not accepted."""
+    """Send a client the rest of the last reading, then a new one; return the bytes that were not accepted."""
     with contextlib.suppress(BlockingIOError):
         while rest:
             rest = rest[client.send(rest) :]

@@ -39,7 +39,7 @@ _SAFETY_NAMES = {
     SafetyMode.RECOVERY: "REDUCED",
     SafetyMode.VIOLATION: "FAULT",
 }
-"""Names of modes that differ from those of RTDE."""
+"""Safety modes whose names in the Robot API differ from those of RTDE."""
 
 FORBIDDEN: Document = {
     "message": "Forbidden - Operation Not Allowed",

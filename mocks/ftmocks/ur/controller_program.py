@@ -23,7 +23,7 @@ class ControllerProgram:
     def __init__(self, name: str) -> None:
         self.name = name
         self.doubts: list[str] = []
-        """Constructs in its text that real controllers are reported to reject."""
+        """Constructs in the text of the program that real controllers are reported to reject."""
 
     @property
     def place(self) -> Place:

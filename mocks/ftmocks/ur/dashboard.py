@@ -116,7 +116,7 @@ _COMMANDS: dict[str, Callable[[Robot], str | None]] = {
     "brake release": _brake_release,
     "restart safety": _restart_safety,
 }
-"""Commands that change the state. They return the reply, or None if the controller refuses."""
+"""Functions of the commands that change the state. They return the reply, or None if the controller refuses."""
 
 
 def answer(robot: Robot, line: str, *, by: str = "dashboard", trusted: bool = True) -> str:

@@ -217,7 +217,7 @@ class Command(NamedTuple):
 
     q: Vector6
     seconds: float
-    """Time from the previous target to this one, s."""
+    """Time from the previous target of servoj to this one, s."""
     lookahead_s: float
     gain: float
 

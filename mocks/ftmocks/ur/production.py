@@ -196,7 +196,7 @@ class Production(ControllerProgram):
         self._write("free", later_s=contact.seconds)
 
     def _hold(self, event: str, part: Body, force_N: Array) -> None:
-        """Change the part in the gripper and the force of the contact at the same time."""
+        """Change the part in the gripper and the force of its support at the same time."""
         self._part, self._force_N = part, force_N
         truth, robot = self._tool.holding(part), self._robot
         self._world.change_load(truth, self.name, self._contact(force_N))

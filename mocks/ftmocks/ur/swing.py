@@ -107,7 +107,7 @@ class Swing:
 
 
 class SwingProgram(ControllerProgram):
-    """The program on the pendant that follows a `Swing`."""
+    """Program on the pendant that moves the arm along a `Swing`."""
 
     def __init__(self, robot: Robot, swing: Swing) -> None:
         super().__init__("swing")

@@ -156,11 +156,11 @@ class Device(ABC, Generic[Frame]):
 
     @abstractmethod
     def _sample(self, count: int) -> None:
-        """Send the next samples of the stream."""
+        """Put the next `count` samples of the stream on the wire."""
 
     @abstractmethod
     def _deliver(self, frames: list[Frame]) -> None:
-        """Deliver the frames that arrive at the client now."""
+        """Write these frames, which arrive at the client now, to the wire."""
 
     @property
     def _readable(self) -> list[int]:

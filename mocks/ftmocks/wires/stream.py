@@ -25,7 +25,7 @@ class ModbusSensor(SerialSensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._burst = bytearray()
-        """Bytes since the last pause; only as many as show that they are too long for a frame."""
+        """Bytes received since the last pause; not more than show that they are too long for a frame."""
         self._last_byte_s = 0.0
 
     @abstractmethod

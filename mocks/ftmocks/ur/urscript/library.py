@@ -80,7 +80,7 @@ _WITHOUT_EFFECT = {
 CONTACT_N = 10.0
 """Smallest force for which `tool_contact` reports a contact, N."""
 RAMP_SHARE = 0.2
-"""Share of the time of a timed move in which it accelerates, and in which it decelerates."""
+"""Share of the duration of a timed move for the acceleration, and the same share for the deceleration."""
 
 
 class Caller(Protocol):
@@ -95,7 +95,7 @@ class Caller(Protocol):
         """Name of the calling thread: only one thread at a time may move the arm."""
 
     def begin_cycle(self) -> None:
-        """Let the calling thread compute as much as in a new cycle."""
+        """Give the calling thread a full allowance of statements again, as at the start of a cycle."""
 
 
 def movej(program: Caller, q: Value, a: Value = 1.4, v: Value = 1.05, t: Value = 0, r: Value = 0) -> Cycles:
@@ -187,7 +187,7 @@ def servoj(
         servo = robot.arm.servo(Command(goal, seconds, lookahead_s, stiffness), program.owner)
     except CannotFollow as error:
         robot.protective_stop(str(error))
-        yield  # the program stays paused here
+        yield  # a protective stop: the program stays paused here
         return
     cycle_s = robot.period_s * robot.settings.time_scale
     while servo.ahead_s > cycle_s - 1e-9:
