@@ -448,7 +448,7 @@ def _explain_alarm(
         least, update = found[single[0]]
         change = _SINGLE[single[0]]
         blocks = set(BLOCKS[single[0]])
-        # Of two changes where one includes the other, such as payload and weight, neither is an alternative.
+        # A change that includes the reported one, or is included in it (as weight in payload), is no alternative to it.
         apart = [kind for kind in single if not (blocks <= set(BLOCKS[kind]) or blocks >= set(BLOCKS[kind]))]
         others = tuple(dict.fromkeys(_SINGLE[kind] for kind in apart if found[kind][0] < least + _INDISTINCT))
         reason = f"{_describe_update(calibration, update)} ({misfit}, {update.chi2:.0f} after the update)"
