@@ -1,4 +1,4 @@
-"""Compensation of recordings of any length, in blocks and without a device."""
+"""Compensation of stored recordings of any length, read in blocks."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -29,7 +29,7 @@ from ftdrivers.interfaces import Array
 # Duration of the first part of a recording, from which the noise is estimated, s.
 _NOISE_S = 30.0
 _OF_FORCE_AND_TORQUE = np.kron(np.eye(2), np.ones((3, 1)))
-# Events that are copied to the compensated recording.
+# Kinds of events that are copied from a recording to the compensated one.
 _KEPT = ("mark", "delay", "stale", "recovered")
 _READING_S = 0.1
 _OUTLIER_SIGMAS = 4.0
@@ -117,7 +117,7 @@ def compensate_recording(
         if not found.samples:
             raise
         failure = error
-        # a contact at the end ends with the recording
+        # end a contact that lasts to the end of the recording
         stream.processor.restart()
         found.add(None, stream.take_events())
     failure = failure or blocks.failure
@@ -134,13 +134,13 @@ def compensate_recording(
 
 
 class _Blocks(SampleSource):
-    """A recording of any length as a source that never waits, with the events that still apply."""
+    """Source of samples that reads a recording without waiting, and copies the events that still apply."""
 
     def __init__(self, recording: AnyRecording, info: StreamInfo, show: Callable[[str], object]) -> None:
         self.info, self._recording, self._show = info, recording, show
         self._newest: Paired | None = None
         self.failure: Exception | None = None
-        """Error that ended the recording early."""
+        """Damage in the recording that ended reading early; None if there is none."""
         self.delay_s: dict[str, Any] | None = None
 
     def open(self) -> None:
@@ -150,7 +150,7 @@ class _Blocks(SampleSource):
         self._coming.close()
 
     def beginning(self) -> Iterator[Paired]:
-        """Yield the first samples; the next pass reports any damage after them."""
+        """Yield the first 30 s of samples for the noise estimate; damage only ends them, because `read` reports it."""
         left = round(_NOISE_S * self.info.sensor_rate_Hz)
         with suppress(BadDataset, BadRecording):
             for block in self._recording.blocks():
@@ -168,7 +168,7 @@ class _Blocks(SampleSource):
                 raise
             self.failure = error
         if measured is None and self._newest is not None:
-            # process the samples that are waiting for later poses
+            # an empty read lets the stream process the samples that wait for later poses
             self.has_ended = True
             return Read(self._newest.rows(slice(0)))
         elif measured is None:
@@ -188,7 +188,7 @@ class _RunningSums(Sink):
     def __init__(self) -> None:
         self.samples, self._gaps = 0, 0
         self._begin_ns, self._end_ns, self._seq = 0, 0, 0
-        # raw and compensated, force and torque
+        # rows: raw and compensated wrench; columns: norms of force and torque
         self._squares, self._largest = np.zeros((2, 2)), np.zeros((2, 2))
         self._contacts: list[dict[str, Any]] = []
 
@@ -241,7 +241,7 @@ def estimated_bias(
     size = max(1, round(_READING_S * info.sensor_rate_Hz))
     readings, orientations = [np.empty((0, 6))], [np.empty((0, 3, 3))]
     waiting: list[Paired] = []
-    # the next pass over the recording ends at the same damage
+    # damage only ends the estimate, because the next pass over the recording reports it
     with suppress(BadRecording):
         for samples, _, share in read_ahead(source.blocks()):
             show(f"Estimating the bias: {share:.0%}")
@@ -274,7 +274,7 @@ def estimated_bias(
 
 
 def _near_median(reading: Array) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the readings (n, 6) near the median of those kept, found iteratively."""
+    """Return a mask (n,) of the readings (n, 6) without outliers, which are far from the median of the others."""
     free = np.ones(len(reading), bool)
     for _ in range(20):
         centre = np.median(reading[free], axis=0)

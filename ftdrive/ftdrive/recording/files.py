@@ -1,4 +1,4 @@
-"""Recordings on disk: file formats by suffix; reading and writing of whole recordings."""
+"""Recordings on disk: choice of the file format by suffix, and reading and writing of recordings."""
 
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import closing
@@ -17,17 +17,17 @@ from ftdrive.recording.table_files import CsvFile, ParquetFile, read_csv, read_p
 from ftdrivers.installation import missing_extra
 
 RecordingFile = McapFile | CsvFile | ParquetFile
-"""A new file in one format. After any error, the first `samples` samples remain in the file."""
+"""A new recording file in one format. After any error, the first `samples` samples remain readable in the file."""
 
 
 class _RecordingFormat(NamedTuple):
-    """A file format."""
+    """A file format of recordings."""
 
     new: type[RecordingFile]
     read: Callable[[Path, Collection[str]], Generator[Piece, None, str]]
-    """Yields the header first, in a piece without samples."""
+    """Reads a file in pieces; the first piece has the header and no samples. Returns why the file ends early."""
     package: str
-    """Package that the format needs."""
+    """Python package that the format needs."""
 
 
 _FORMATS = {
@@ -39,7 +39,7 @@ ENDINGS = tuple(_FORMATS)
 
 
 def format_of(path: Path) -> _RecordingFormat:
-    """Return the format of a recording. Raises `ConfigError` if it is unknown or its package is missing."""
+    """Return the format for a recording's suffix. Raises `ConfigError` if it is unknown or its package is missing."""
     ending = Path(path.name.removesuffix(".partial")).suffix
     if ending not in _FORMATS:
         raise ConfigError(f"{path} does not have the suffix of a recording: name it .mcap, .csv or .parquet")
@@ -51,7 +51,7 @@ def format_of(path: Path) -> _RecordingFormat:
 
 
 def grown_as(path: Path) -> Path:
-    """Return the file that a stream is written to: MCAP at first for formats that are unreadable until complete."""
+    """Return the file to which a stream is written: an MCAP file first if the format is unreadable until complete."""
     return path if format_of(path).new.grows else path.with_name(f"{path.name}.mcap")
 
 
@@ -95,13 +95,13 @@ class RecordingReader:
 
     def __init__(self, path: Path, columns: Collection[str] = ROW.names or ()) -> None:
         self.path, self.cut = path, ""
-        """Why the recording ends early, known after reading; empty if it is complete."""
+        """Reason why the file ends early, known once it is read to its end; empty if the recording is complete."""
         self._columns, self._read = columns, format_of(path).read
         with closing(self._pieces()) as pieces:
             self.header = next(pieces).header
 
     def pieces(self) -> Iterator[Piece]:
-        """Yield the samples as stored. Raises `BadRecording` after the last intact piece."""
+        """Yield the stored samples. Raises `BadRecording` for an empty file, and for damage after the intact pieces."""
         count = 0
         for piece in self._pieces():
             count += len(piece.rows)
@@ -110,7 +110,7 @@ class RecordingReader:
             raise BadRecording("it contains no sample: the file was cut, or the stream ended at once", self.path)
 
     def blocks(self) -> Iterator[Measured]:
-        """Yield the samples as measured: wrench and pose with their times. Raises the errors of `pieces`."""
+        """Yield the raw wrenches and poses with their times in blocks. Raises the errors of `pieces`."""
         return in_blocks(piece.measured() for piece in self.pieces())
 
     def _pieces(self) -> Generator[Piece, None, None]:
@@ -125,11 +125,11 @@ def load_recording(path: str | Path, columns: Collection[str] = ROW.names or ())
 
     Raises `BadRecording` for a damaged or empty file. A truncated file is read to its end; `cut` then gives the reason.
     """
-    # Damage raises an error, because a caller in Python would not see a printed message.
+    # Damage raises an error instead of a printed message, which a caller in Python would not see.
     reader = RecordingReader(Path(path), columns)
     pieces = list(reader.pieces())
     events = [event for piece in pieces for event in piece.events]
-    reduce(next_header, events, reader.header)  # a stage from a newer version raises an error here
+    reduce(next_header, events, reader.header)  # raise an error for a stage from a newer version
     return Recording(reader.header, np.concatenate([piece.rows for piece in pieces]), events, reader.cut)
 
 

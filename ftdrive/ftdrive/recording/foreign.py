@@ -40,24 +40,24 @@ if TYPE_CHECKING:
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 _BAG: Final = b"#ROSBAG V2.0\n"
 _POSES: Final = "geometry_msgs/msg/PoseStamped"
-# A column: times in ns, and values.
+# The values of a topic: times in ns, and one row of values per time.
 _Column = tuple[NDArray[np.int64], Array]
-# A message: time of receipt in ns, and content.
+# A message of a ROS bag: time of receipt in ns, and encoded content.
 _Message = tuple[int, bytes]
 
 T = TypeVar("T")
-# Window of the delay estimate, s: longer than any recording.
+# Window of the delay estimate, s, longer than any recording, so that all samples are used.
 _WHOLE = 10**6
 _MEAN_S = 0.008
 # Number of samples before and after a step that decide whether it is a gap.
 _NEAR = 100
 _ROUNDS = 20
-# Largest deviation of regular times from multiples of the period, in periods.
+# Times are regular if their steps deviate from multiples of the period by less than this, in periods.
 _REGULAR = 0.2
 
 
 def is_recording(path: Path) -> bool:
-    """Whether `ftdrive record` wrote a file, judged by its suffix, the first line (CSV) or the writer (MCAP)."""
+    """Whether a file is from `ftdrive record`: by its suffix, and by its first line (CSV) or named writer (MCAP)."""
     ending = Path(path.name.removesuffix(".partial")).suffix
     if ending != ".csv":
         return ending in ENDINGS and not is_bag(path)
@@ -93,7 +93,7 @@ def tables_of(
 ) -> tuple[Table, Table] | None:
     """Return the table of wrenches and the table of poses, possibly the same one; None for a recording of ftdrive.
 
-    `source` is a Path, a DataFrame or a mapping. Raises `BadDataset`, `ConfigError` or `OSError`.
+    `source` is a Path, a DataFrame or a mapping. Raises the errors of `Table` and, for a ROS bag, of `read_bag`.
     """
     if pair is not None:
         return Table(pair[0], options), Table(pair[1], options)
@@ -107,7 +107,7 @@ def tables_of(
 
 
 def moving_source(source: Any, options: SolveOptions) -> Path | tuple[Table, Table] | None:
-    """Return the input of `solve_recording`; None for poses at rest. Raises the errors of `tables_of`."""
+    """Return a recording in motion for `solve_recording`; None for poses at rest. Raises the errors of `tables_of`."""
     if options.pair is None and isinstance(source, Path):
         # A run folder or a dataset has poses at rest.
         has_poses = source.is_dir() or source.suffix == ".json"
@@ -121,7 +121,7 @@ def moving_source(source: Any, options: SolveOptions) -> Path | tuple[Table, Tab
 
 
 def table_words(tables: tuple[Table, Table]) -> str:
-    """Return what was recognised in the tables of a recording as one line; empty for standard tables."""
+    """Return a line about the recognised formats of the tables; empty if all names and units are those of ftdrive."""
     return "; ".join(dict.fromkeys(f"{one.name}: {one.words}" for one in tables if one.words))
 
 
@@ -130,7 +130,7 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
 
     The topics of WrenchStamped and PoseStamped may be omitted if there is only one of each. `pose_topic` may also have
     the form of an arm address: ``tf?base=base&flange=tool0`` or ``/joint_states?urdf=arm.urdf&flange=tool0``. Raises
-    `ConfigError` if the package rosbags is missing or a topic must be given, and `BadDataset`.
+    `ConfigError` if the package rosbags is missing or a topic must be given, and `BadDataset` for an unusable bag.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -139,7 +139,7 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
         raise ConfigError(missing_extra(path.name, "rosbags", "ros2")) from None
     if path.suffix == ".bag":
         with open_file(path) as file:
-            if file.read(len(_BAG)) != _BAG:  # rosbags would read a whole line, however long
+            if file.read(len(_BAG)) != _BAG:  # rosbags would read the whole first line, however long
                 raise BadDataset(f"{path.name}: the first bytes are not those of a ROS 1 bag: record it again")
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
@@ -190,14 +190,14 @@ def _read_topics(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[_
 
 
 def _number_column(reader: "AnyReader", topic: str, messages: Sequence[_Message], count: int) -> _Column:
-    """Return times (n,) in ns (of receipt if no message has a stamp), and the numbers (n, count) after the header."""
+    """Return times (n,), ns, from the stamps or else of receipt, and the `count` numbers that follow each header."""
     if not messages:
         raise BadDataset(f"{topic} has no message: give another topic")
     received_ns = np.array([received for received, _ in messages])
     data = [one for _, one in messages]
     if reader.is2 and data[0][:2] != b"\0\1":
         raise BadDataset(f"{topic} is not encoded as little-endian CDR: record it again with the default RMW")
-    # ROS 1 begins with a counter, ROS 2 with four encoding bytes. In ROS 2, numbers are aligned to multiples of 8.
+    # A ROS 1 message begins with a counter, a ROS 2 message with 4 encoding bytes, and its numbers align to 8 bytes.
     (length,) = struct.unpack_from("<I", data[0], 12)
     start = 4 + -(-(12 + length) // 8) * 8 if reader.is2 else 16 + length
     if {len(one) for one in data} != {len(data[0])} or len(data[0]) < start + 8 * count:
@@ -233,7 +233,7 @@ def _pose_reader(reader: "AnyReader", pose_topic: str | None) -> PoseReader:
 
 
 def _pose_column(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[_Message]]) -> _Column:
-    """Return times (m,) in ns, and quaternions x, y, z, w with positions (m, 7)."""
+    """Return times (m,), ns, and flange poses (m, 7): quaternions x, y, z, w, then positions, m."""
     if isinstance(named, Poses):
         (topic,) = named.topics
         t_ns, numbers = _number_column(reader, topic, messages[topic], 7)
@@ -303,7 +303,7 @@ class TablePair:
         self.delay_s, self.delay_sigma_s = self._estimated_delay() if delay_s is None else (delay_s, 0.0)
 
     def blocks(self) -> Iterator[Measured]:
-        """Yield the samples in blocks, each sample with its pose. Raises `BadDataset` after the last valid block."""
+        """Yield the samples with their poses in blocks. A fault raises `BadDataset` after the last valid block."""
         # Each call reads the files again, because a binary copy would need 1.4 GB per hour of samples.
         share = [0.0]
 
@@ -312,7 +312,7 @@ class TablePair:
                 yield from (block.rows(slice(i, i + PIECE_ROWS)) for i in range(0, len(block), PIECE_ROWS))
 
         paired = pair_blocks(samples(), _states_of(self._orientation), self.delay_s)
-        # The blocks are as large as for other recordings, because the contact test works block by block.
+        # Regroup to the block size of other recordings, because the result of the contact test depends on the size.
         return in_blocks(Measured(block, (), share[0]) for block in paired)
 
     def _estimated_delay(self) -> tuple[float, float]:
@@ -325,7 +325,7 @@ class TablePair:
 
 
 def _before_a_fault(parts: Iterator[T]) -> Iterator[T]:
-    """Yield the parts before a fault, if there are any; the next pass reports the fault."""
+    """Yield the parts before a `BadDataset`, which is raised only if there are none; a later pass raises it again."""
     count = 0
     try:
         for part in parts:
@@ -348,7 +348,7 @@ def _mean_samples(table: Table, size: int) -> Iterator[FtSamples]:
 
 
 def _numbered_samples(table: Table) -> Iterator[tuple[FtSamples, float]]:
-    """Yield the samples, numbered by their times, and the share of the table read so far."""
+    """Yield blocks of samples, numbered by their times, with the share of the table read so far."""
     known, number = 0, 0
     t_s, wrench, place = np.empty(0), np.empty((0, 6)), 0.0
     for rows in chain(table.wrenches(), [None]):
@@ -358,7 +358,7 @@ def _numbered_samples(table: Table) -> Iterator[tuple[FtSamples, float]]:
                 continue
         numbers = sample_numbers(t_s)
         numbers += number - numbers[max(known - 1, 0)]
-        # the following samples show whether a step is a gap
+        # keep the last samples for the next round, because only the samples after a step show whether it is a gap
         end = len(t_s) if rows is None else len(t_s) - _NEAR
         if end > known:
             yield FtSamples.of(_ns(t_s[known:end]), numbers[known:end], wrench[known:end]), place
@@ -379,7 +379,7 @@ def sample_numbers(t_s: Array) -> NDArray[np.int64]:
         if steps.min() >= 1 and np.abs(steps_s / step_s - steps).max() < _REGULAR:
             return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
     number = np.arange(len(t_s))
-    # the period is estimated from the number of all samples, including missing ones
+    # repeat, because the period follows from the number of all samples, including the missing ones
     for _ in range(_ROUNDS):
         before, number = number, _with_gaps(t_s, float(t_s[-1] - t_s[0]) / int(number[-1]))
         if np.array_equal(number, before):
@@ -393,11 +393,11 @@ def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
         return number
     steps = np.diff(t_s) / period_s
     late = t_s / period_s - number
-    # minimum over each sample and those before it
+    # smallest delay of each sample and those before it
     earliest = minimum_filter1d(late, _NEAR, mode="nearest", origin=(_NEAR - 1) // 2)
-    following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # this row and later ones
+    following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # this sample and later ones
     possible = np.flatnonzero((steps > 1.5) & (following[1:] - earliest[:-1] > 0.4))
-    # largest steps first
+    # check the largest steps first
     for last in possible[np.argsort(-steps[possible])].tolist():
         near = slice(max(last + 1 - _NEAR, 0), last + 1), slice(last + 1, last + 1 + _NEAR)
         before, after = (t_s[rows] / period_s - number[rows] for rows in near)
@@ -407,7 +407,7 @@ def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
 
 
 def _states_of(table: Table) -> Iterator[ArmStates]:
-    """Yield the orientations of the flange; positions and joint angles are NaN."""
+    """Yield arm states with the orientations of a table; positions, joint angles and speeds are NaN."""
     for rows in table.poses():
         unknown = np.full((len(rows.t_s), 6), np.nan)
         R = rows.values[:, :9].reshape(-1, 3, 3)

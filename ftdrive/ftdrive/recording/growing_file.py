@@ -9,10 +9,10 @@ from ftcalib.files import open_file, require_new
 
 
 class GrowingFile:
-    """A new file. Raises `OSError` if it or its `.partial` exists, or if the folder is not writable."""
+    """A new file, written as `.partial`. Raises `OSError` if either file exists, or if the folder is not writable."""
 
     grows: ClassVar = True
-    """Whether an incomplete file can be read."""
+    """Whether a file of this format can be read before it is complete."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -26,7 +26,7 @@ class GrowingFile:
         return self._file.tell()
 
     def add(self, content: bytes) -> int:
-        """Append bytes; return their offset. After an error the file is unchanged."""
+        """Append bytes; return their offset in the file. If writing fails, the file keeps its old content."""
         start = self._file.tell()
         left = memoryview(content)
         try:
@@ -39,7 +39,7 @@ class GrowingFile:
         return start
 
     def complete(self) -> None:
-        """Write the end, sync the file to disk and rename it. Raises `OSError`, also if the new name exists."""
+        """Write the end, sync the file to disk and rename it. Raises `OSError` if that fails or the new name exists."""
         try:
             self._write_end()
             # Sync before closing releases the lock, because a sync may take seconds.
@@ -50,7 +50,7 @@ class GrowingFile:
         self.partial.rename(self.path)
 
     def _write_end(self) -> None:
-        """Write what ends a file of the format; this class writes nothing."""
+        """Write what a file of the format ends with, such as an index; nothing in this base class."""
 
     def discard(self) -> None:
         """Delete the file."""
@@ -58,7 +58,7 @@ class GrowingFile:
         self.partial.unlink(missing_ok=True)
 
     def keep(self) -> None:
-        """Close the incomplete file and keep it."""
+        """Close the file and leave it on disk as `.partial`."""
         self._file.close()
 
 
@@ -78,7 +78,7 @@ def _lock(file: IO[bytes]) -> bool:
 
 
 def _lock_holder(file: IO[bytes]) -> str:
-    """Return the name of the process that locked a file, from /proc/locks; see proc_locks(5)."""
+    """Return "process ID" for the process that locked a file, else "another process"; see proc_locks(5)."""
     with suppress(OSError):
         for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
             _, kind, *_, process, place, _, _ = line.split()
@@ -88,9 +88,9 @@ def _lock_holder(file: IO[bytes]) -> str:
 
 
 def partial_of(path: Path, *, grows: bool) -> Path:
-    """Return the path of the incomplete file. Raises `OSError` if it or `path` exists, or if the folder does not.
+    """Return the `.partial` of a new file. Raises `OSError` if either exists, or if their folder does not exist.
 
-    `grows` is true if an incomplete file can be read.
+    `grows` is true if a file of this format can be read before it is complete; an error message depends on it.
     """
     partial = path.with_name(path.name + ".partial")
     require_new(path)

@@ -1,4 +1,4 @@
-"""Writers of recordings: files written together, recorders for a stream and for raw readings, and conversion."""
+"""Writers of recordings: several files at once, recorders for a stream and for raw readings, and conversion."""
 
 import signal
 import threading
@@ -26,12 +26,12 @@ from ftdrive.recording.recording import ROW, Header, Rows, read_ahead, split_pie
 from ftdrive.stream.samples import Block, StreamEvent, StreamInfo
 from ftdrive.stream.stream import Sink, Stream
 
-# Duration of the samples in one write, ns; each write delays the stream by a few ms.
+# Samples are written in batches of this duration, ns, because each write delays the stream by a few ms.
 _FLUSH_NS = 200_000_000
 
 
 class RecordingFiles:
-    """New files that are written together, each with all samples. Raises the errors of `Recorder`."""
+    """New files, each of which gets all samples. Raises `OSError` if a file exists or cannot be created."""
 
     def __init__(self, paths: Sequence[Path], header: Header) -> None:
         self.saved: list[Path] = []
@@ -46,9 +46,9 @@ class RecordingFiles:
             stack.pop_all()
 
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
-        """Write samples in one frame, and the events since the previous samples.
+        """Append samples, all in one frame, and the events since the previous samples to all files.
 
-        Raises `OSError`; then no file is completed, and the message states what each `.partial` contains.
+        Raises `OSError` if a file cannot be written; no file is then completed, and the message states what each has.
         """
         with _delay_signals():
             try:
@@ -63,13 +63,13 @@ class RecordingFiles:
                 raise
 
     def complete(self) -> None:
-        """Write every sample that is left, and complete all files.
+        """Complete all files, even if one of them fails.
 
         Raises `OSError` if a file cannot be completed; its message states what each `.partial` contains.
         """
         files, self._files, failure = self._files, [], None
         with _delay_signals():
-            # after an error the list of files is empty
+            # after an error in `append`, the list of files is empty
             for path, file in zip(self._paths, files, strict=False):
                 try:
                     file.complete()
@@ -101,7 +101,7 @@ class RecordingFiles:
 
 
 class Recorder(Sink):
-    """Writes a stream to new files, .mcap, .csv or .parquet by suffix, from the first sample on.
+    """Writes a stream to new files (.mcap, .csv or .parquet, by suffix), which are created at the first sample.
 
     Changes of the frame or the stages become events with the time of the first sample after them. An incomplete Parquet
     file cannot be read, so `x.parquet` is recorded as `x.parquet.mcap` and converted at the end. If the stream is
@@ -129,7 +129,7 @@ class Recorder(Sink):
         self.samples, self.gaps, self.lost = 0, 0, 0
         self.first_ns = self.last_ns = 0
         self.show: Callable[[str], object] = lambda _: None
-        """Receives progress messages, because the final conversion may take a minute per hour of samples."""
+        """Called with progress messages, because the final conversion may take a minute per hour of samples."""
         require_new_recordings(paths)
         self._info, self._configuration = info, configuration
         self._grown = {path if repeatable else grown_as(path): path for path in paths}
@@ -159,11 +159,11 @@ class Recorder(Sink):
         return (self.samples - 1) / self.duration_s if self.duration_s else 0.0
 
     def begin(self, stream: Stream) -> None:
-        """Keep the stream to record its delay at the end; a replayed recording has its own delay events."""
+        """Keep the stream to record its delay at the end, except if it is repeatable and has its own delay events."""
         self._stream = None if self._is_repeatable else stream
 
     def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
-        """Record the samples within the limits. Raises the errors of `RecordingFiles.append`."""
+        """Record the samples up to the limits of duration and count. Raises the errors of `RecordingFiles.append`."""
         if block:
             left = len(block) if self._count is None else self._count - self.samples
             if self._duration_s is not None:
@@ -208,7 +208,7 @@ class Recorder(Sink):
                         self._convert(self._files, grown, path)
 
     def _convert(self, files: RecordingFiles, grown: Path, path: Path) -> None:
-        """Convert a complete recording to another format and delete it; after an error it remains. Raises `OSError`."""
+        """Convert the file `grown` to the format of `path`, then delete it. After a failure it stays: `OSError`."""
         files.saved.remove(grown)
         try:
             write_recording(path, RecordingReader(grown))
@@ -228,7 +228,7 @@ class Recorder(Sink):
             self._files.discard()
 
     def _follow(self, block: Block) -> None:
-        """Create the files at the first block, and record a change of the frame or the stages."""
+        """Create the files at the first block; at later ones, record a change of frame or stages as an event."""
         t_ns = int(block.t_host_ns[0])
         if self._header is None:
             self._header, self.first_ns = Header(self._info, block.frame, block.stages, self._configuration), t_ns
@@ -240,7 +240,7 @@ class Recorder(Sink):
         if block.stages != self._header.stages:
             changes.append(StreamEvent(t_ns, "stages", f"The stages are {block.stages}", asdict(block.stages)))
         if changes:
-            # all samples of one flush are in one frame
+            # write the previous samples, because all samples of one write must be in one frame
             self._flush()
             self._events += changes
             self._header = replace(self._header, frame=block.frame, stages=block.stages)
@@ -284,7 +284,7 @@ def convert_recording(
 ) -> tuple[dict[str, Any], BaseException | None]:
     """Convert a recording of any length to a new file; return samples, duration_s and gaps, and what ended it early.
 
-    Damage and Ctrl-C end the file after the last valid piece. Raises `BadRecording` if the first piece is damaged, and
+    Damage and Ctrl-C end the new file after the last valid piece. Raises `BadRecording` if no piece is valid, and
     the `OSError` of `RecordingFiles`. `show` receives progress messages.
     """
     files = RecordingFiles([target], reader.header)

@@ -39,9 +39,9 @@ FORMAT: Final = "ftdrive.recording/1"
 Rows = NDArray[np.void]
 """(n,) records of type `ROW`."""
 PIECE_ROWS: Final = 1 << 13
-"""Number of samples in a piece, which fits into the processor cache."""
+"""Number of samples in a piece, small enough for the processor cache."""
 ZSTD_LEVEL: Final = -5
-"""Compression level of zstd, low because values with noise in their last digits hardly shrink at any level."""
+"""Compression level of zstd: a fast one, because values with noise in their last digits hardly shrink at any level."""
 
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 _GROUPS: Mapping[str, tuple[str, Sequence[str]]] = {
@@ -60,24 +60,24 @@ _GROUPS: Mapping[str, tuple[str, Sequence[str]]] = {
 ROW: Final = np.dtype(
     [(name, kind, (len(names),)) if names else (name, kind) for name, (kind, names) in _GROUPS.items()]
 )
-"""One sample, with fields as in `Block`; the quaternion is x, y, z, w."""
+"""Type of the record of one sample: fields named as in `Block`, and the orientation as a quaternion x, y, z, w."""
 NEEDED: Final = ("t_host_ns", "seq", "raw", "p_base_flange_m", "quaternion_base_flange")
-"""Columns required for compensation."""
+"""Fields of `ROW` that are required to compensate a recording."""
 NUMBERS: Final = {name: names or (name,) for name, (_, names) in _GROUPS.items()}
-"""Columns in the table formats for each field of `ROW`."""
+"""Names of the columns that hold each field of `ROW` in the table formats (CSV, Parquet)."""
 
 
 def flat_layout(kind: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the layout of `ROW`, or of some of its fields, with one field per number."""
+    """Return the type of a record with one field per number; `kind` is `ROW` or has some of its fields."""
     return np.dtype([(one, kind[name].base) for name in kind.names or () for one in NUMBERS[name]])
 
 
 COLUMNS: Final = flat_layout(ROW)
-"""Columns of the table formats."""
+"""Type of a sample's record with one field per column of the table formats (CSV, Parquet)."""
 
 
 def table_of(rows: Rows, start_ns: int, utc_offset_ns: int) -> dict[str, NDArray[Any]]:
-    """Return the columns of the table formats: the times for other programs, then the numbers in the rows.
+    """Return the columns of a CSV or Parquet file: `t_s` and `t_utc_s` for other programs, then the fields of `rows`.
 
     `start_ns` is `t_host_ns` of the first sample of the recording.
     """
@@ -87,16 +87,16 @@ def table_of(rows: Rows, start_ns: int, utc_offset_ns: int) -> dict[str, NDArray
 
 
 def places_of(events: Sequence[StreamEvent], rows: Rows) -> list[int]:
-    """Return for each event the number of samples before it.
+    """Return for each event the number of `rows` before it.
 
-    Samples at the time of an event come before it, unless it changes the frame or the stages. Events keep their order.
+    A sample with the time of an event counts as before it, except for events that change the frame or the stages.
     """
     after_ns = [event.t_host_ns + (event.kind not in ("frame", "stages")) for event in events]
     return list(accumulate(np.searchsorted(rows["t_host_ns"], after_ns).tolist(), max))
 
 
 def to_records(samples: Block | Paired) -> Rows:
-    """Return paired samples as records; fields that they lack are 0."""
+    """Return samples as records of type `ROW`; fields that the samples lack are 0."""
     rows = np.zeros(len(samples), ROW)
     for name in _GROUPS:
         if hasattr(samples, name):
@@ -107,7 +107,7 @@ def to_records(samples: Block | Paired) -> Rows:
 
 
 def _paired_of(rows: Rows) -> Paired:
-    """Return samples as measured, with their poses; columns that were not read are 0."""
+    """Return the measured part of records: raw wrenches with their poses; columns that were not read are 0."""
 
     def column(name: str) -> NDArray[Any]:
         if name in (rows.dtype.names or ()):
@@ -154,7 +154,7 @@ class Header:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build the header from the content of a file; unknown fields are ignored. Raises `BadRecording`."""
+        """Build the header from JSON, ignoring unknown fields. Raises `BadRecording` if it is damaged or newer."""
         check_format(document, FORMAT, BadRecording)
         try:
             # files from earlier versions lack the fields with defaults
@@ -191,7 +191,7 @@ def _frame_from_dict(values: Mapping[str, Any]) -> WrenchFrame:
 
 
 def _stages_of(values: Mapping[str, Any]) -> Stages:
-    """Build the stages from a header or an event; a missing stage did not exist at that time, so it was off."""
+    """Build the stages from JSON; a missing stage was off, because the version that wrote the file did not have it."""
     usual: dict[str, Any] = {item.name: item.default for item in fields(Stages)}
     off = {name: None if value is None else type(value)() for name, value in usual.items()}
     if newer := [name for name, value in dict(values).items() if value and name not in off]:
@@ -206,7 +206,7 @@ def event_text(event: StreamEvent) -> str:
 
 
 def event_of(text: str) -> StreamEvent:
-    """Build an event from a line made by `event_text`. Raises `ValueError`."""
+    """Build an event from a line made by `event_text`. Raises `ValueError` for any other line."""
     try:
         values = parsed_json(text)
         return StreamEvent(values["t_host_ns"], values["kind"], values["text"], values["values"])
@@ -215,46 +215,46 @@ def event_of(text: str) -> StreamEvent:
 
 
 class Piece(NamedTuple):
-    """Consecutive samples of a recording, as stored."""
+    """Consecutive samples of a recording, with all stored columns."""
 
     header: Header
     rows: Rows
     events: Sequence[StreamEvent]
-    """Events since the previous piece."""
+    """Events of the recording since the previous piece."""
     share: float
-    """Share of the recording up to the end of this piece, 0 to 1."""
+    """Share of the recording read up to the end of this piece, 0 to 1."""
 
     def measured(self) -> "Measured":
-        """Return the samples as measured."""
+        """Return the measured part of the piece: raw wrenches and poses, without the compensated wrench."""
         return Measured(_paired_of(self.rows), self.events, self.share)
 
 
 class Measured(NamedTuple):
-    """Consecutive samples of a recording as measured: wrench and pose with their times."""
+    """Consecutive samples of a recording, with only what was measured: raw wrench and pose with their times."""
 
     samples: Paired
     events: Sequence[StreamEvent]
     share: float
-    """Share of the recording up to the end of these samples, 0 to 1."""
+    """Share of the recording read up to the end of these samples, 0 to 1."""
 
 
 class AnyRecording(Protocol):
-    """A recording of any length."""
+    """Interface of a recording of any length that can be read in blocks, several times."""
 
     @property
     def header(self) -> Header:
-        """Header of the whole recording."""
+        """Header of the recording."""
 
     @property
     def cut(self) -> str:
-        """Why the recording ends early, known after reading; empty if it is complete."""
+        """Reason why the file ends early, known once it is read to its end; empty if the recording is complete."""
 
     def blocks(self) -> Iterator[Measured]:
-        """Yield all samples in blocks; each call starts again. Raises `BadRecording` after the last valid block."""
+        """Yield all samples in blocks, from the start at each call. Damage raises an error after the valid blocks."""
 
 
 def with_calibration(header: Header, calibration: CalibrationResult, name: str) -> Header:
-    """Return a header with another calibration."""
+    """Return a copy of a header with another calibration, which `name` names, and without a verification."""
     info = replace(header.info, result=calibration, calibration_name=name, verification=None, calibration_state="")
     if not np.isfinite(info.p_flange_sensor_m).all():
         info = replace(info, p_flange_sensor_m=sensor_origin_m(None, calibration))
@@ -323,11 +323,11 @@ class Recording(Displayed):
         return int(np.count_nonzero(np.diff(self.rows["seq"]) != 1))
 
     def paired(self) -> Paired:
-        """Return the samples as measured, with their poses; columns that were not read are 0."""
+        """Return the raw wrenches with their poses; columns that were not read are 0."""
         return _paired_of(self.rows)
 
     def pieces(self) -> Iterator[Piece]:
-        """Yield samples in pieces of one frame, with the events since the previous piece and the header valid there."""
+        """Yield the samples in pieces with one frame and stages, each with its header and the events before it."""
         header = self.header
         for rows, events in split_piece(Piece(header, self.rows, self.events, 1.0)):
             for event in events:
@@ -335,19 +335,19 @@ class Recording(Displayed):
             yield Piece(header, rows, events, 1.0)
 
     def blocks(self) -> Iterator[Measured]:
-        """Yield the samples as measured, in blocks."""
+        """Yield the raw wrenches with their poses in blocks of `PIECE_ROWS` samples."""
         return in_blocks(piece.measured() for piece in self.pieces())
 
 
 def next_header(header: Header, event: StreamEvent) -> Header:
-    """Return the header valid after an event. Raises `BadRecording` for a stage from a newer version."""
+    """Return the header after an event, which may change the frame or stages. An unknown stage is a `BadRecording`."""
     if event.kind == "frame":
         return replace(header, frame=_frame_from_dict(event.values))
     return replace(header, stages=_stages_of(event.values)) if event.kind == "stages" else header
 
 
 def split_piece(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
-    """Divide samples at changes of frame or stages, and every `PIECE_ROWS`; events stay before the next samples."""
+    """Divide samples at changes of frame or stages, and every `PIECE_ROWS`; events come with the samples after them."""
     n = len(piece.rows)
     events = sorted(piece.events, key=lambda event: event.t_host_ns)
     at = places_of(events, piece.rows)
@@ -361,8 +361,8 @@ def split_piece(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
 
 
 def read_ahead(items: Iterator[T]) -> Generator[T, None, None]:
-    """Yield items while a thread makes the next one; an error in the thread is raised after the items before it."""
-    # One thread reads and one processes. Only the main thread writes, so that errors and Ctrl-C keep their order.
+    """Yield items while a thread takes the next one; an error of `items` is raised after the items before it."""
+    # The new thread only reads; the caller's thread processes and writes, so that errors and Ctrl-C keep their order.
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(next, items, None)
         while (item := following.result()) is not None:
@@ -371,7 +371,7 @@ def read_ahead(items: Iterator[T]) -> Generator[T, None, None]:
 
 
 def in_blocks(parts: Iterable[Measured]) -> Iterator[Measured]:
-    """Yield the samples of parts of any size in blocks of `PIECE_ROWS`, up to an error."""
+    """Regroup parts of any size into blocks of `PIECE_ROWS` samples; before raising an error, yield those before it."""
     waiting, count, events, share, failure = list[Paired](), 0, list[StreamEvent](), 0.0, None
     try:
         for part in parts:

@@ -25,7 +25,7 @@ from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 def open_replay(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> Stream:
     """Open the stream of a run folder, a recording (by default with its own calibration) or another program's table.
 
-    Raises `ConfigError` without a calibration, and `DataError` or `OSError` for a file that cannot be used.
+    Raises `ConfigError` if there is no calibration, and `DataError` or `OSError` for a file that cannot be used.
     """
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     is_run = is_run_folder(path)
@@ -49,12 +49,12 @@ def open_replay(path: Path, calibration: Path | None, frame: WrenchFrame, *, spe
 
 
 def is_run_folder(path: Path) -> bool:
-    """Whether the path is a run folder, and not an interrupted recording."""
+    """Whether a path is a folder, which is taken as a run; the `.partial` of an interrupted recording is not one."""
     return path.is_dir() and path.suffix != ".partial"
 
 
 def source_of_run(run: Run, calibration: CalibrationResult, name: str = "") -> RecordingSource:
-    """Return the poses of a run as a source, one after the other; the moves between them were not recorded.
+    """Return a source with the samples of a run's poses one after the other, without the moves, which have no samples.
 
     `name` names the calibration. Raises `BadDataset` for a damaged run or a run without poses.
     """
@@ -71,7 +71,7 @@ def source_of_run(run: Run, calibration: CalibrationResult, name: str = "") -> R
             Paired(
                 t_host_ns=np.empty(n, np.int64),
                 t_device_s=samples.t_device_s,
-                # keep the gaps that lost samples left
+                # numbers keep the gaps of lost samples, and go on from pose to pose
                 seq=samples.seq - samples.seq[0] + count,
                 status=samples.status,
                 raw=samples.wrench,

@@ -27,12 +27,12 @@ Moving = Run | Path | tuple[Table, Table]
 
 
 def read_place(place: Path, options: SolveOptions) -> Moving | RecordedData:
-    """Return poses at rest, or a recording in motion, unread until it is solved. Raises the errors of `read_source`."""
+    """Return poses at rest, or a recording in motion, which is read when solved. Raises the errors of `read_source`."""
     if any(options.topics) and (options.pair is not None or not is_bag(place)):
         raise ConfigError("--wrench-topic and --pose-topic are only for a ROS bag: leave them out")
     moving: Moving | None
     if is_bag(place) and options.method != "ml":
-        moving = place  # avoid reading a whole bag only to raise the error below
+        moving = place  # do not read the bag, because the error below follows
     elif place.is_dir() and Run(place).in_motion:
         moving = Run(place)
     else:
@@ -43,9 +43,9 @@ def read_place(place: Path, options: SolveOptions) -> Moving | RecordedData:
 
 
 def solve_place(data: Moving | RecordedData, options: SolveOptions) -> CalibrationResult:
-    """Solve the data from `read_place`; with an earlier result, solve only for the tool.
+    """Solve the data from `read_place`; if the options have an earlier result, solve only for the tool.
 
-    Raises `ConfigError` for values that the method cannot use.
+    Raises `ConfigError` for options that the solution method cannot use, in addition to the errors of the solvers.
     """
     if isinstance(data, RecordedData):
         method: Any = options.method
@@ -113,7 +113,7 @@ def solve_recording(
 
 
 def _read_in_motion(source: Path | Recording) -> tuple[Means, Means, Header]:
-    """Return wrenches, poses (with positions, if any) and header. Raises the errors of `RecordingReader.pieces`."""
+    """Return means of wrenches and poses (R, and p if known), and the header. Errors as in `RecordingReader.pieces`."""
     reader = source if isinstance(source, Recording) else RecordingReader(source, NEEDED)
     wrench, poses = Means(), Means()
     if isinstance(source, Recording) and (missing := {*NEEDED} - {*(source.rows.dtype.names or ())}):
