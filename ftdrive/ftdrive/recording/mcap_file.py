@@ -57,7 +57,7 @@ _SCHEMAS: Final[Mapping[str, ros2.Schema]] = {
 }
 _CHANNELS: Final = {topic: number for number, topic in enumerate(_SCHEMAS, 1)}
 _SAMPLE: Final = [("t_device_s", "<f8"), ("chi2", "<f8"), ("seq", "<i8"), ("status", "<u4"), ("in_contact", "?")]
-# Columns in the messages of a channel, and the number of bytes after them.
+# For each channel, the columns of a sample in its messages, and the number of bytes after them in the message.
 _COLUMNS: Final[Mapping[int, tuple[Any, int]]] = {
     _CHANNELS[ros2.RAW]: (np.dtype([("raw", "<f8", 6)]), 0),
     _CHANNELS[ros2.COMPENSATED]: (np.dtype([("wrench", "<f8", 6)]), 0),
@@ -65,26 +65,26 @@ _COLUMNS: Final[Mapping[int, tuple[Any, int]]] = {
     _CHANNELS[ros2.JOINTS]: (np.dtype([("q_rad", "<f8", 6)]), 8),
     _CHANNELS[SAMPLE]: (np.dtype(_SAMPLE), 0),
 }
-# Time between two messages on /tf, ns: no screen is redrawn more often.
+# Shortest time between two messages on /tf, ns, because viewers redraw their screen at most 60 times per second.
 _TRANSFORMS_STEP_NS: Final = 16_666_667
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _ATTACHMENT, _DATA_END = 3, 4, 5, 6, 7, 9, 15
-# Marks the end of a truncated file; not an opcode of MCAP.
+# Stands for the missing end of a truncated file in place of an opcode; MCAP itself does not use 0.
 _CUT = 0
-# Layout of the fields before the body of a message.
+# Layout of the bytes before the body of an MCAP message; `log` and `publish` are its two times.
 _HEAD: Final = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
 _NONE: Final = np.zeros(0, np.int64)
 
 
-# Times (n,), sequence numbers, and the n messages of each topic; messages with the same time are consecutive.
+# Times (n,), sequence numbers, and n messages for each topic; messages of one time are written one after the other.
 _Group = tuple[NDArray[np.int64], ArrayLike, Mapping[str, ros2.Messages]]
 
 
 class McapFile(GrowingFile):
-    """A new recording as MCAP."""
+    """A new recording in the MCAP format."""
 
     def __init__(self, path: Path, header: Header) -> None:
         from mcap.records import Attachment, AttachmentIndex, Channel, Schema
@@ -118,7 +118,7 @@ class McapFile(GrowingFile):
         return place
 
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
-        """Write samples and events as one chunk. Raises `OSError`."""
+        """Write samples and events as one MCAP chunk. Raises `OSError` if the file cannot be written."""
         from mcap.records import Chunk, ChunkIndex
         from zstandard import compress
 
@@ -166,7 +166,7 @@ class McapFile(GrowingFile):
                     yield np.array([event.t_host_ns + offset_ns]), 0, {topic: np.frombuffer(packed, f"V{len(packed)}")}
 
     def _messages(self, groups: Sequence[_Group]) -> tuple[memoryview, dict[int, NDArray[np.uint64]]]:
-        """Return a chunk's messages, valid until the next call, and the times and offsets (n, 2) of each channel."""
+        """Return a chunk's messages, valid until the next call, and for each channel their times and offsets (n, 2)."""
         widths = [sum(_HEAD.itemsize + body.itemsize for body in bodies.values()) for *_, bodies in groups]
         messages = self._room(sum(len(t_ns) * width for (t_ns, *_), width in zip(groups, widths, strict=True)))
         tables, place = defaultdict(list), 0
@@ -186,7 +186,7 @@ class McapFile(GrowingFile):
         return messages.data, {number: np.concatenate(parts).astype("<u8") for number, parts in tables.items()}
 
     def _room(self, size: int) -> NDArray[np.uint8]:
-        """Return the first bytes of a reused buffer: allocating one per chunk would take a third of the time."""
+        """Return `size` bytes of a buffer, reused because a new one per chunk would take a third of the time."""
         if size > len(self._memory):
             self._memory = np.concatenate([self._memory, np.empty(2 * size - len(self._memory), np.uint8)])
         return self._memory[:size]
@@ -230,7 +230,7 @@ def _pack_samples(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, 
 
 
 def _pack_log(event: StreamEvent, offset_ns: int) -> bytes:
-    """Pack an event as a Log message: the kind as its name, the values as JSON in `function`."""
+    """Pack an event as a ROS Log message: its kind in the field `name`, its values as JSON in `function`."""
     stamp = divmod(event.t_host_ns + offset_ns, 1_000_000_000)
     packed = struct.pack("<iIB3x", *stamp, 30 if event.kind in ros2.WARNINGS else 20)
     for text in (event.kind, event.text, "", json.dumps(dict(event.values))):
@@ -240,14 +240,14 @@ def _pack_log(event: StreamEvent, offset_ns: int) -> bytes:
 
 
 def _pack_load(event: StreamEvent) -> bytes:
-    """Pack a weighing, which is also stored as an event; unknown values are NaN."""
+    """Pack mass and centre of mass of a weighing for plots of viewers; unknown values are NaN."""
     values, nowhere = event.values, [np.nan] * 3
     com_m, sigma_m = values["p_sensor_com_m"] or nowhere, values["p_sensor_com_sigma_m"] or nowhere
     return struct.pack("<8d", values["mass_kg"], values["mass_sigma_kg"], *com_m, *sigma_m)
 
 
 def _pack_tracked(event: StreamEvent) -> bytes:
-    """Pack the tracked bias and the part; an unknown age is infinite."""
+    """Pack the tracked bias and part; the age is infinite if the bias has not been seen yet."""
     values = event.values
     age_s = np.inf if values["last_seen_s"] is None else values["last_seen_s"]
     part = values["part_kg"], values["part_sigma_kg"], age_s, values["part_known"]
@@ -274,7 +274,7 @@ def _bytes(*records: "McapRecord") -> bytes:
 
 
 def read_mcap(path: Path, columns: Collection[str]) -> Generator[Piece, None, str]:
-    """Read a recording in pieces; return why it ends early. Raises `BadRecording` or `OSError`."""
+    """Read an MCAP recording in pieces; return why it ends early, or "". Damage raises `BadRecording`."""
     from zstandard import ZstdError
 
     documents: dict[str, Any] = {}
@@ -328,9 +328,9 @@ def _mcap_header(documents: Mapping[str, Any]) -> Header:
 
 
 def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Yield the complete records of the data section, then `_CUT` if its end is missing.
+    """Yield opcode and bytes of the complete records in an MCAP file's data section; at the end of a cut file, `_CUT`.
 
-    Raises `ValueError` if the CRC does not match, or if the file was completed without the end of the data.
+    Raises `ValueError` if the CRC does not match, or if the file has its last bytes but no end of the data section.
     """
     crc = zlib.crc32(MAGIC)
     while len(start := file.read(9)) == 9:
@@ -353,13 +353,13 @@ def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
 
 
 def _require_crc(crc: int, stored: bytes) -> None:
-    """Raise `ValueError` unless the CRC-32 equals the stored one; 0 means no CRC, as other programs write."""
+    """Raise `ValueError` unless a CRC-32 equals the stored one. A stored 0, as some programs write, means no CRC."""
     if struct.unpack("<I", stored) not in ((0,), (crc,)):
         raise ValueError("its bytes differ from their checksum")
 
 
 class _Content:
-    """Columns and events of the chunks since the last piece, with times on the cell's clock."""
+    """Collects columns and events of MCAP chunks until `piece` returns them; its times are on the cell's clock."""
 
     def __init__(self, header: Header, columns: Collection[str]) -> None:
         self._header = header
@@ -368,10 +368,10 @@ class _Content:
         self._events: list[StreamEvent] = []
         self._messages = b""
         self.indexes: list[bytes] = []
-        """Indexes of the channels in the chunk; other programs may have divided the file into other chunks."""
+        """Message indexes of the channels in the open chunk."""
 
     def open_chunk(self, data: bytes) -> None:
-        """Unpack the messages of a chunk, and check their CRC."""
+        """Unpack the messages of an MCAP chunk, and check their CRC; `close_chunk` then reads them."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Chunk
         from mcap.stream_reader import get_chunk_data_stream
@@ -380,9 +380,9 @@ class _Content:
         self._messages = stream.read(size)
 
     def close_chunk(self) -> bool:
-        """Take the messages of the chunk; return whether there are any. Raises `ValueError` unless all are indexed.
+        """Decode the messages of the open chunk; return whether there were any.
 
-        The indexes are checked, because the CRC of a chunk covers only its messages.
+        Raises `ValueError` unless its indexes name all messages; the CRC of the chunk does not cover the indexes.
         """
         messages, indexes, self._messages, self.indexes = self._messages, self.indexes, b"", []
         found = [_read_index(messages, index) for index in indexes]
@@ -406,7 +406,7 @@ class _Content:
         return bool(messages)
 
     def piece(self, share: float) -> Piece:
-        """Return the complete samples and the events; samples with missing columns wait for the next chunk."""
+        """Return the complete samples and the events read so far; samples with missing columns wait for more chunks."""
         columns = {name: np.concatenate([np.empty(0, ROW[name]), *parts]) for name, parts in self._columns.items()}
         rows = np.empty(min(map(len, columns.values())), self._kind)
         for name, column in columns.items():
@@ -418,7 +418,7 @@ class _Content:
 
 
 def _read_index(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return an index's channel, and the times, starts and ends (n,) of its messages, after comparing it with them."""
+    """Return the channel, times, starts and ends (n,) of an index's messages. Raises `ValueError` if they differ."""
     channel, size = struct.unpack_from("<HI", index)
     t_ns, places = np.frombuffer(index, "<i8", size // 8, 6).reshape(-1, 2).T
     heads = _gather(messages, places, _HEAD)
@@ -428,8 +428,8 @@ def _read_index(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], 
 
 
 def _require_complete(messages: bytes, places: NDArray[np.int64], ends: NDArray[np.int64]) -> None:
-    """Raise `ValueError` if there is anything but schemas and channels between the indexed messages."""
-    # only the offsets within each channel are in order
+    """Raise `ValueError` if a chunk has anything but schema and channel records between its indexed messages."""
+    # sort, because only the offsets within each channel are in order
     order = np.argsort(places, kind="stable")
     begins, stops = np.append(places[order], len(messages)), np.insert(ends[order], 0, 0)
     for stop, begin in zip(stops[stops != begins].tolist(), begins[stops != begins].tolist(), strict=True):
@@ -444,7 +444,7 @@ def _require_complete(messages: bytes, places: NDArray[np.int64], ends: NDArray[
 
 
 def _gather(data: bytes, places: NDArray[np.int64], kind: np.dtype[Any]) -> NDArray[Any]:
-    """Return the values at these offsets, without a copy if the offsets are equidistant."""
+    """Return the values of type `kind` at these offsets of `data`, without a copy if the offsets are equidistant."""
     if len(places) and (places.min() < 0 or places.max() + kind.itemsize > len(data)):
         raise ValueError("an index points outside its chunk")
     steps = np.diff(places)

@@ -53,7 +53,7 @@ from ftdrive.recording.recording import (
 from ftdrive.stream.samples import StreamEvent
 
 FIRST_BYTES = f"# {FORMAT.partition('/')[0]}/".encode()
-"""First bytes of a recording of any version."""
+"""First bytes of a CSV recording of any version."""
 _HEADER, _EVENT, _CRC, _END = "# header ", "# event ", "# crc32 ", "# end"
 _GROUP_ROWS: Final = 1 << 14
 _PARQUET_END: Final = b"PAR1"
@@ -72,7 +72,7 @@ class _TableFile(GrowingFile):
 
 
 class CsvFile(_TableFile):
-    """A new CSV file."""
+    """A new recording in the CSV format."""
 
     def __init__(self, path: Path, header: Header) -> None:
         super().__init__(path, header)
@@ -81,7 +81,7 @@ class CsvFile(_TableFile):
         self._add(f"# {FORMAT}: {header.words}\n{_HEADER}{json.dumps(header.to_dict())}\n{names}\n")
 
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
-        """Write samples, and each event at its time. Raises `OSError`."""
+        """Write samples, and each event between the samples around it. Raises `OSError` if that fails."""
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\n")
         lines = list(self._lines(rows)) if len(rows) else []
@@ -110,7 +110,7 @@ class CsvFile(_TableFile):
 
 
 def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str]:
-    """Read a recording in pieces; return why it ends early. Raises `BadRecording` or `OSError`."""
+    """Read a CSV recording in pieces; return why it ends early, or "". Damage raises `BadRecording`."""
     size = path.stat().st_size
     with open_file(path) as file:
         if not file.readline(100).startswith(FIRST_BYTES):
@@ -145,7 +145,7 @@ def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str
                     if len(lines) >= PIECE_ROWS:
                         yield piece()
                         lines, events = [], []
-            except BadRecording as error:  # the lines before the fault are valid
+            except BadRecording as error:  # yield the lines before the damage first
                 failure = error
             yield piece()
         except ValueError as error:
@@ -156,7 +156,7 @@ def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str
 
 
 def _checked_lines(file: BufferedReader) -> Iterator[list[str]]:
-    """Yield the lines before each matching checksum, and the end."""
+    """Yield the lines before each checksum, and the last line `# end`. A wrong checksum raises `BadRecording`."""
     crc, waiting, begin = 0, list[str](), 0
     for number, line in enumerate(read_lines(file, BadRecording), 1):
         if file.tell() - begin > MOST_BYTES:
@@ -189,7 +189,7 @@ def _parse_document(text: str) -> dict[str, object]:
 
 
 class ParquetFile(_TableFile):
-    """A new Parquet file. It cannot be read before it is complete, so `samples` stays 0."""
+    """A new recording in the Parquet format. The file is unreadable until complete, so `samples` stays 0."""
 
     grows = False
     closed = False
@@ -213,12 +213,12 @@ class ParquetFile(_TableFile):
         )
 
     def write(self, content: bytes) -> None:
-        """Append bytes encoded by pyarrow. Raises `OSError`."""
-        if not self._file.closed:  # pyarrow writes an end even to a discarded file
+        """Append bytes for pyarrow, which uses this object as its file. Raises `OSError` if that fails."""
+        if not self._file.closed:  # pyarrow writes the end of the file even after `discard`
             self.add(content)
 
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
-        """Buffer samples and events; write a row group when there are enough. Raises `OSError`."""
+        """Buffer samples and events; write enough samples as a row group. Raises `OSError` if writing fails."""
         self._waiting += [rows] if len(rows) else []
         self._events += map(event_text, events)
         if sum(map(len, self._waiting)) >= _GROUP_ROWS:
@@ -258,7 +258,7 @@ def _text_crc(texts: Mapping[bytes, bytes]) -> str:
 
 
 def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None, str]:
-    """Read a recording in pieces; return "", as a truncated Parquet file is unreadable. Errors as for `read_csv`."""
+    """Read a Parquet recording in pieces; return "", because a truncated file raises `BadRecording`, as damage does."""
     from pyarrow import ArrowException, parquet
 
     with open_file(path) as raw:
@@ -269,12 +269,12 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
                 "interrupted, repeat it. If `record` of an older ftdrive was interrupted, convert it with that version"
             )
     try:
-        # With a buffer, the columns of a large row group are not read all at once.
+        # With a buffer size, pyarrow does not read the columns of a large row group all at once.
         with parquet.ParquetFile(path, page_checksum_verification=True, buffer_size=1 << 20) as file:
             texts, total = file.metadata.metadata or {}, file.metadata.num_rows
             if not {b"header", b"events"} <= texts.keys():
                 raise BadRecording("it has no header of ftdrive: another program wrote it")
-            # Files from earlier versions have no checksum here.
+            # Parquet files from earlier versions of ftdrive have no checksum of the header.
             if texts.get(b"crc32", b"").decode() not in ("", _text_crc(texts)):
                 raise BadRecording("its header differs from its checksum: the file is damaged")
             if not file.schema_arrow.remove_metadata().equals(_arrow_schema()):
@@ -288,12 +288,12 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
             for number in range(file.num_row_groups):  # one reader for all row groups would keep their data in memory
                 group = file.metadata.row_group(number)
                 if len({group.column(i).compression for i in range(group.num_columns)}) > 1:
-                    raise BadRecording("its footer is inconsistent: the file is damaged")  # the footer has no checksum
+                    raise BadRecording("its footer is inconsistent: the file is damaged")  # it has no checksum
                 for batch in file.iter_batches(2 * _GROUP_ROWS, [number], sorted(names), use_threads=False):
                     rows = np.empty(len(batch), numbers)
                     for name in numbers.names or ():
                         column = batch[name].cast("uint8") if COLUMNS[name].kind == "b" else batch[name]
-                        rows[name] = np.from_dlpack(column)  # pandas is not imported
+                        rows[name] = np.from_dlpack(column)  # so that pyarrow does not import pandas
                     times = np.from_dlpack(batch["t_host_ns"]).view([("t_host_ns", "<i8")])
                     here = sum(place < len(times) for place in places_of(events, times))
                     count += len(rows)
@@ -303,7 +303,7 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
                 raise BadRecording(f"it has {count} of its {total} samples: the file is damaged")
             yield Piece(header, np.zeros(0, kind), events, 1.0)
     except (ArrowException, MemoryError, OSError, TypeError, ValueError) as error:
-        if getattr(error, "errno", None) is not None:  # a disk error; pyarrow sets no errno
+        if getattr(error, "errno", None) is not None:  # a disk error, because pyarrow's own errors have no errno
             raise
         why = next(iter(str(error).splitlines()), type(error).__name__)
         raise BadRecording(f"it cannot be read ({why}): the file is damaged") from error

@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 def is_run(folder: Path) -> bool:
-    """Return whether a folder is a run folder."""
+    """Return whether a folder is a run folder, which has a run.json."""
     return (folder / "run.json").is_file()
 
 

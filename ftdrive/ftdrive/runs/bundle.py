@@ -52,19 +52,19 @@ _IPV4 = re.compile(r"(?<![\w.])\d{1,3}(?:\.\d{1,3}){3}(?![\w.]\d|\w)")
 _IPV6 = re.compile(r"(?<![\w:.])[0-9A-Fa-f]*:[0-9A-Fa-f:]+(?![\w:.])")
 _MAC = re.compile(r"(?<![\w:-])(?:[0-9A-Fa-f]{2}[:-]){5}[0-9A-Fa-f]{2}(?![\w:-])")
 _HOST_FIELD = re.compile(r'"host": ?"([A-Za-z0-9.-]+)"|"said": ?{[^}]*"robot": ?"([A-Za-z0-9.-]+)"')
-# Endings of URL schemes whose host part is no host in the cell.
+# Schemes with these endings have no host of the cell in their URLs, so its name is not redacted.
 _NO_NETWORK = ("can", "emulated", "http", "https", "file")
-# Common names of accounts and hosts, which identify no person; their home directories are redacted.
+# Names of accounts and hosts that identify no person, so they are kept; home directories with them are redacted.
 _NOT_PERSONAL = {"root", "user", "robot", "ur", "admin", "ubuntu", "operator", "localhost"}
-# Fields in which four numbers separated by dots are versions, not addresses.
+# Fields of JSON files that are not redacted, because four numbers separated by dots are versions there.
 _VERSIONS = ("versions", "packages", "firmware")
-# Smallest share of printable bytes in a text. Bytes with a smaller share are measurements, which stay unchanged.
+# Bytes of a transcript are text if at least this share is printable. Others are measurements, which stay unchanged.
 _TEXT_SHARE = 0.9
 # Fields of a transcript that contain bytes in hexadecimal form.
 _ON_THE_WIRE = ("hex", "request", "reply")
 
 
-# Returns the replacement for a match of some kind, such as "ip".
+# Function that returns the replacement for a match of a kind such as "ip".
 _Instead = Callable[[str, re.Match[str]], str]
 
 
@@ -79,7 +79,7 @@ class Redaction:
         self.placeholders: dict[str, str] = {}
         """Placeholder of each redacted value; never written to a file."""
         self._names: dict[str, str] = {}
-        # The user of a container may have no name.
+        # ignore errors, because the user of a container may have no name
         with suppress(OSError, KeyError):
             self._learn_name("user", getpass.getuser())
         self._learn_name("host", platform.node())
@@ -92,7 +92,7 @@ class Redaction:
         return {kind: kinds.count(kind) for kind in sorted(set(kinds))}
 
     def learn(self, text: str) -> None:
-        """Collect the names of hosts and users from the paths, addresses and host fields in a file."""
+        """Collect the names of hosts and users that occur in the paths, URLs and host fields of a file's text."""
         for value in _texts_of_file(text):
             for user in _HOME.findall(value):
                 self._learn_name("user", user)
@@ -103,9 +103,9 @@ class Redaction:
             self._learn_name("host", found[1] or found[2])
 
     def file(self, text: str) -> str:
-        """Return a redacted text file: the values of JSON, as one document or as lines, or the whole text.
+        """Return the text of a file with redacted values if it is JSON or JSON lines, else with all text redacted.
 
-        Valid checksums are computed again; invalid ones stay, so that damage is still detected.
+        Checksums that were valid are computed again; others stay invalid, so that damage is still detected.
         """
         if (document := _parse_document(text)) is not None:
             if isinstance(document, dict) and "checksum" in document and not is_changed(document):
@@ -122,8 +122,8 @@ class Redaction:
         return json.dumps(self.json(document))
 
     def json(self, value: JSON, key: str = "") -> JSON:
-        """Return a JSON value with redacted strings; its keys are kept."""
-        # JSON is parsed, so that no escape sequence hides a name.
+        """Return a JSON value with its strings redacted, but not its keys; `key` is the field that contains it."""
+        # Parsed values are redacted, because escape sequences of JSON could hide a name.
         if key in _VERSIONS:
             return value
         if isinstance(value, dict):
@@ -135,7 +135,7 @@ class Redaction:
         return self._wire(value) if key in _ON_THE_WIRE else self.text(value)
 
     def text(self, text: str) -> str:
-        """Return a redacted string."""
+        """Return a string in which addresses and names are replaced by placeholders."""
         return self._redacted(text, self._placeholder)
 
     def _redacted(self, text: str, instead: _Instead) -> str:
@@ -150,7 +150,7 @@ class Redaction:
         return text
 
     def _wire(self, text: str) -> str:
-        """Return hexadecimal bytes with names masked if the bytes are text; the number of bytes is kept."""
+        """Redact hexadecimal bytes if they are text: each address or name becomes as many letters x."""
         try:
             sent = bytes.fromhex(text)
         except ValueError:
@@ -180,7 +180,7 @@ class Redaction:
 
 
 def _is_address(text: str) -> bool:
-    """Return whether a text is an IP address that other computers can reach."""
+    """Return whether a text is an IP address, except a loopback address or 0.0.0.0."""
     try:
         address = ipaddress.ip_address(text)
     except ValueError:
@@ -189,7 +189,7 @@ def _is_address(text: str) -> bool:
 
 
 def _parse_document(text: str) -> JSON | None:
-    """Return a JSON object or list; None for any other text."""
+    """Return the JSON object or list in a text; None for any other text."""
     try:
         document = parsed_json(text)
     except ValueError:
@@ -198,7 +198,7 @@ def _parse_document(text: str) -> JSON | None:
 
 
 def _texts_of_file(text: str) -> Iterator[str]:
-    """Yield the strings in the JSON of a file, unescaped, and its lines that are not JSON."""
+    """Yield the string values in a file's JSON, with escape sequences decoded, and its lines that are not JSON."""
     for part in [text] if _parse_document(text) is not None else text.splitlines():
         document = _parse_document(part)
         yield from [part] if document is None else _values(document)
@@ -213,7 +213,7 @@ def _values(value: Any) -> Iterator[str]:
 
 
 FORMAT: Final = "ftdrive.bundle/1"
-# Largest total size of an unpacked bundle, bytes. One hour at 7 kHz takes 3 GB.
+# Largest total size of an unpacked bundle, bytes. One hour of samples at 7 kHz takes 3 GB.
 MOST_BYTES: Final = 4_000_000_000
 MOST_FILES: Final = 20_000
 _COPY_AGAIN: Final = "copy the bundle again, or ask for a new one"
@@ -255,7 +255,7 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
         redaction.learn(text)
     clean = {name: redaction.file(text) for name, text in texts.items()}
     emulated = None
-    with suppress(BadDataset):  # a damaged run can be bundled too
+    with suppress(BadDataset):  # because damaged runs are bundled too
         emulated = Run(folder).header().get("station") is not None
     about = {
         "format": FORMAT,
@@ -278,12 +278,12 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
 
 @contextmanager
 def unpack(source: Path) -> Iterator[Path]:
-    """Yield the unpacked run folder of a bundle, which is deleted afterwards; yield any other source unchanged.
+    """Yield the run folder in a bundle, unpacked until the block ends; for another source, yield it unchanged.
 
     Raises
     ------
     BadBundle
-        The file is damaged, is not a bundle, is too large, or contains paths that lead out of its folder.
+        The zip file is damaged, is not a bundle, is too large, or contains paths that lead out of its folder.
     """
     if source.suffix.lower() != ".zip" or source.is_dir():
         yield source
@@ -341,7 +341,7 @@ def _decode_text(content: bytes) -> str | None:
 
 
 def _environment(folder: Path) -> dict[str, Any]:
-    """Return the versions, and the checks of this computer and of the described cell."""
+    """Return the content of environment.json: versions, and checks of this computer and the run's configuration."""
     packages = {about["Name"]: about["Version"] for about in (each.metadata for each in distributions())}
     facts: dict[str, Any] = {
         "versions": versions(),
@@ -354,7 +354,7 @@ def _environment(folder: Path) -> dict[str, Any]:
         cell = recorded_cell(Run(folder).header()["config"])
         checks = [check_disk(folder), check_workcell(cell, cell.robot.model)]
         checks += check_permissions(SensorAddress.of(cell.sensor.url))
-    # A damaged run can be bundled too.
+    # no error, because damaged runs are bundled too
     except (BadDataset, UsageError, TypeError) as error:
         return facts | {"error": str(error)}
     return facts | {"checks": [asdict(check) for check in checks]}

@@ -25,12 +25,12 @@ from ftdrive.cell.config import without_password
 from ftdrive.errors import NotAccepted
 from ftdrive.runs import is_run
 
-# Listing results must not import numpy.
+# Only for type checkers: listing results must not import numpy, which takes long.
 if TYPE_CHECKING:
     from ftcalib import CalibrationResult, SensorMatrix
 
 _NAME: Final = re.compile(r"sensor(?:-(\d+))?\.json")
-# Properties of a sensor that must not change if its matrix is to stay valid. Counts differ between calibration slots.
+# Facts of a sensor to which its matrix is bound. The counts per unit differ between the sensor's calibration slots.
 _FACTS: Final = {
     "counts_per_N": "counts per N",
     "counts_per_Nm": "counts per N·m",
@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 EMULATED: Final = "EMULATED"
 EDITED: Final = "EDITED BY HAND"
 FOREIGN: Final = "OF ANOTHER CELL"
-# Marks that every output shows for certain calibrations, with their meaning.
+# Warning marks that every output shows for certain calibrations, with their meaning.
 MARKS: Final[Mapping[str, str]] = {
     EMULATED: "The cell was EMULATED: these are not the values of a real tool.",
     EDITED: "The file was EDITED BY HAND after it was solved: its verdict and sigmas no longer apply to its numbers.",
@@ -52,19 +52,19 @@ MARKS: Final[Mapping[str, str]] = {
 
 
 def made_now() -> dict[str, Any]:
-    """Return the origin recorded in every file: time, command line and versions."""
+    """Return the origin that every file made now records: time, command line and versions."""
     argv = [without_password(word) for word in sys.argv]
     return {"created_utc": datetime.now(UTC).isoformat(), "argv": argv, "versions": versions()}
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the software that produces a result."""
+    """Return the versions of ftdrive, Python, the platform and the packages on which a result depends."""
     own = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}
     return own | {name: version(name) for name in ("numpy", "scipy", "python-can", "pyserial")}
 
 
 def at(document: Any, *keys: str) -> Any:
-    """Return the value at a path of keys in a document; None if it does not exist."""
+    """Return the value at a path of keys in nested JSON objects; None if it does not exist."""
     for key in keys:
         document = document.get(key) if isinstance(document, Mapping) else None
     return document
@@ -77,21 +77,21 @@ def text_at(document: Any, *keys: str) -> str | None:
 
 
 def number_at(document: Any, *keys: str) -> float | None:
-    """Return the finite number at a path of keys; None for any other value."""
+    """Return the finite number at a path of keys in JSON objects; None for any other value."""
     value = at(document, *keys)
     usable = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
     return float(value) if usable else None
 
 
 def numbers_at(document: Any, n: int, *keys: str) -> list[float] | None:
-    """Return the list of n finite numbers at a path of keys; None for any other value."""
+    """Return the list of n finite numbers at a path of keys in JSON objects; None for any other value."""
     values = at(document, *keys)
     numbers = [number for number in map(number_at, values) if number is not None] if isinstance(values, list) else []
     return numbers if len(numbers) == n == len(values or ()) else None
 
 
 def time_at(document: Any, *keys: str) -> str | None:
-    """Return the time at a path of keys as UTC in ISO 8601 with microseconds, sortable as text; else None."""
+    """Return the time at a path of keys as UTC in ISO 8601 with microseconds, sortable as text; None for no time."""
     try:
         return datetime.fromisoformat(at(document, *keys)).astimezone(UTC).isoformat(timespec="microseconds")
     except (TypeError, ValueError):
@@ -144,7 +144,7 @@ def read_calibration(path: str | Path, *, accept_edited: bool = False) -> "Calib
 
 
 def require_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) -> None:
-    """Raise `NotAccepted` for a rejected result; `to_be_saved` adds that it was not saved."""
+    """Raise `NotAccepted` for a rejected result; with `to_be_saved`, the message adds that it was not saved."""
     if result.verdict == "rejected":
         unsaved = " and was not saved" if to_be_saved else ""
         codes = ", ".join(dict.fromkeys(item.code for item in result.findings if item.severity != "note"))
@@ -152,7 +152,7 @@ def require_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) 
 
 
 def marks_of(calibration: "CalibrationResult", *, emulated: bool = False, foreign: bool = False) -> tuple[str, ...]:
-    """Return the `MARKS` of a calibration; `emulated` and `foreign` describe the cell to which it is applied."""
+    """Return those `MARKS` that apply; `emulated` and `foreign` are facts of the cell that uses the calibration."""
     applying = {
         EMULATED: emulated or calibration.provenance.get("station") is not None,
         EDITED: calibration.is_edited,
@@ -162,12 +162,12 @@ def marks_of(calibration: "CalibrationResult", *, emulated: bool = False, foreig
 
 
 def sensor_files(folder: Path = Path()) -> list[Path]:
-    """Return the sensor-matrix files in a folder, the oldest first."""
+    """Return the files sensor.json, sensor-2.json, … in a folder, the oldest first."""
     return sorted(filter(_file_number, folder.glob("sensor*.json")), key=_file_number)
 
 
 def next_sensor_file(folder: Path = Path()) -> Path:
-    """Return the path for the next sensor matrix."""
+    """Return the unused path for the next sensor matrix in a folder, such as sensor-2.json."""
     number = 1 + max(map(_file_number, sensor_files(folder)), default=0)
     return folder / (f"sensor-{number}.json" if number > 1 else "sensor.json")
 
@@ -196,7 +196,7 @@ def sensor_identity(origin: Mapping[str, Any]) -> dict[str, JSON]:
 
 
 def identity_mismatch(sensor: "SensorMatrix", identity: Mapping[str, JSON]) -> str:
-    """Return why a matrix does not belong to the sensor with this identity, as a clause; empty if it does."""
+    """Return a clause with why a sensor matrix does not belong to a sensor identity; empty if it does."""
     theirs = sensor.provenance.get("sensor")
     if not isinstance(theirs, Mapping):
         return "it was saved without the model and the range of its sensor: run `ftdrive loads solve` again"
@@ -211,9 +211,9 @@ def identity_mismatch(sensor: "SensorMatrix", identity: Mapping[str, JSON]) -> s
 
 
 def with_sensor(calibration: "CalibrationResult", folder: Path = Path()) -> "CalibrationResult":
-    """Return the calibration with the newest matrix of its sensor in a folder, if there is one, to decode contacts.
+    """Return the calibration, to which the newest matrix of its sensor in a folder is added to decode contacts.
 
-    A warning is logged if the newest matrix with the same serial number, or without one, cannot be used.
+    Without such a matrix, it is unchanged. If a matrix seems meant for the sensor but cannot be used, logs a warning.
 
     Raises `BadCalibration` or `OSError` if a file cannot be read.
     """
@@ -233,7 +233,7 @@ def with_sensor(calibration: "CalibrationResult", folder: Path = Path()) -> "Cal
 
 
 def _comparable(value: JSON) -> JSON:
-    """Return a value with numbers rounded to 9 digits, for comparison."""
+    """Return a JSON value with numbers rounded to 9 digits, so that equal values from two files compare equal."""
     if isinstance(value, list | tuple):
         return [_comparable(item) for item in value]
     return float(f"{value:.9g}") if isinstance(value, float | int) and not isinstance(value, bool) else value

@@ -1,4 +1,4 @@
-"""A load of known mass on the tool during a run, from options, run.json or a dataset."""
+"""A load of known mass on the tool during a run, as given by options, run.json or a dataset."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from ftcalib.sampling import Sampling
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.arm_model import STRING_M, WEIGHT_HEIGHT_M, WEIGHT_RADIUS_M
 
-# Relative standard deviation of a mass given without a sigma, as for a kitchen scale.
+# Relative standard deviation of a mass given without one: that of a mass weighed on a kitchen scale.
 MASS_SHARE: Final = 1e-3
 _FARTHEST_MM: Final = 2000.0
 _HEAVIEST_KG: Final = 100.0
@@ -22,7 +22,7 @@ _SWING_ATTEMPTS: Final = 6
 
 
 class Load(KnownLoad):
-    """A known load in a session: hanging on a string from a point of the tool, or gripped at an unknown position."""
+    """A known load in a session, which hangs on a string from the tool, or is gripped at an unknown position."""
 
     __slots__ = ()
 
@@ -45,7 +45,7 @@ class Load(KnownLoad):
         return None if self.gripped else self.mass_kg * STANDARD_GRAVITY_M_S2 * sin(_MOST_SWING_RAD)
 
     def sampling(self, usual: Sampling) -> Sampling:
-        """Return the sampling of a pose, which is longer for a hanging load to cover several periods of its swing."""
+        """Return how to sample a pose: as `usual`, but longer for a hanging load, to average over its swing."""
         return usual if self.gripped else replace(usual, average_s=_SWING_S, attempts=_SWING_ATTEMPTS)
 
     @property
@@ -66,7 +66,7 @@ class Load(KnownLoad):
 
     @classmethod
     def of(cls, mass: str, place: str | None, *, gripped: bool) -> Self:
-        """Return the load given by the options `--load`, `--at` and `--gripped`; raises `ConfigError`."""
+        """Return the load given by `--load`, `--at` and `--gripped`. Invalid options raise `ConfigError`."""
         mass_kg, sigma_kg = mass_of(mass)
         if (place is None) != gripped:
             raise ConfigError("--load needs a position: give its hook, such as --at tip=0,0,200, or --gripped")
@@ -99,7 +99,7 @@ class Load(KnownLoad):
 
 
 def mass_of(text: str) -> tuple[float, float]:
-    """Return the mass and its standard deviation, kg, from a text such as 2.0 or 2.0±0.002; raises `ConfigError`."""
+    """Return mass and standard deviation, kg, from a text such as 2.0 or 2.0±0.002. Others raise `ConfigError`."""
     try:
         mass_kg, *rest = (float(part) for part in re.split(r"±|\+/?-", text))
         sigma_kg = rest[0] if rest else MASS_SHARE * mass_kg
@@ -113,7 +113,7 @@ def mass_of(text: str) -> tuple[float, float]:
 
 
 def place_of(text: str) -> tuple[str, tuple[float, float, float]]:
-    """Return the name and the position, m, from a text NAME=x,y,z in mm from the flange face; raises `ConfigError`."""
+    """Return name and position, m, from a text NAME=x,y,z in mm from the flange face. Others raise `ConfigError`."""
     name, given, numbers = text.partition("=")
     if not re.fullmatch(r"[\w-]+", name):
         raise ConfigError(f"the place '{text}' has no name: give one such as tip=0,0,200")

@@ -1,4 +1,4 @@
-"""Raw recording of a free tool in motion: all samples from sensor and arm, in one file of a run or in several parts."""
+"""Recording of a free tool in motion: all samples of sensor and arm, in one file of a run or in several parts."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -16,7 +16,7 @@ from ftdrive.runs.numbers import DAMAGE, read_arrays, write_arrays
 from ftdrivers.interfaces import ArmStates, FtSamples
 
 FORMAT: Final = "ftdrive.motion/1"
-# Arrays, each with the shape of one sample; a sensor may have any number of counts.
+# Arrays in the file, with the shape of one sample in each; None is any shape, because sensors differ in `counts`.
 _WRENCH: Final = {"t_host_ns": (), "t_device_s": (), "seq": (), "counts": None, "wrench": (6,), "status": ()}
 _POSES: Final = {
     "t_host_ns": (),
@@ -35,10 +35,10 @@ class MotionRecording:
     samples: FtSamples
     states: ArmStates
     nominal_rate_Hz: float = math.nan
-    """Nominal rate of the sensor; NaN if the sensor is polled."""
+    """Nominal rate of the sensor; NaN for a polled sensor, which has none."""
 
     def save(self, path: Path) -> None:
-        """Write a new file; return once it is on disk."""
+        """Write the recording to a new file; return once it is on disk."""
         wrench = {f"wrench_{name}": getattr(self.samples, name) for name in _WRENCH}
         poses = {f"pose_{name}": getattr(self.states, name) for name in _POSES}
         arrays = {"format": np.array(FORMAT), "nominal_rate_Hz": np.array(self.nominal_rate_Hz), **wrench, **poses}
@@ -46,7 +46,7 @@ class MotionRecording:
 
     @classmethod
     def load(cls, path: Path) -> "MotionRecording":
-        """Read a recording; raises `BadDataset`."""
+        """Read a file made by `save`. Raises `BadDataset` if it is damaged or has another format."""
         try:
             data = read_arrays(path)
             if str(data.get("format")) != FORMAT:
@@ -61,7 +61,7 @@ class MotionRecording:
 
     @property
     def count(self) -> Array:
-        """Times on the sensor's clock, s, or sample numbers; NaN for a polled sensor, which has neither."""
+        """What the sensor gives to order its samples: times on its clock, s, or numbers; NaN for a polled sensor."""
         if np.isfinite(self.samples.t_device_s).all():
             return self.samples.t_device_s
         even = math.isfinite(self.nominal_rate_Hz)
@@ -69,11 +69,11 @@ class MotionRecording:
 
 
 def means_of(path: Path) -> tuple[Means, Means]:
-    """Return means of the wrench and of the pose for the estimator, with host times since the first sample, s.
+    """Return means of wrench and pose for the motion estimator, with host times since the first sample, s.
 
-    The files of a recording in parts are read twice, so that only one is in memory at a time. Raises `BadDataset`.
+    Each file is read twice, so that only one is in memory at a time. Damage or missing samples raise `BadDataset`.
     """
-    files = files_of(path)  # listed once, because the recording may still grow
+    files = files_of(path)  # the same for both passes, even if the recording grows
     times = [
         (part.samples.t_host_ns, part.count, part.states.t_host_ns, part.states.t_device_s)
         for part in map(MotionRecording.load, files)
@@ -114,7 +114,7 @@ def _signal_columns(
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the files of a recording: the file itself, or the parts in a folder in order."""
+    """Return the files of a recording in motion: `path` itself, or its parts in order if it is a folder."""
     files = sorted(path.glob("*.npz"), key=lambda file: file.stem.zfill(9)) if path.is_dir() else [path]
     if not files:
         raise BadDataset(f"{path} has no samples yet: record for a few seconds")

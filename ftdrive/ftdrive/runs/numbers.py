@@ -14,19 +14,19 @@ from typing import Any, Final
 
 from ftcalib.files import MOST_BYTES, parsed_json, read_file, write_new
 
-# Errors that `zipfile` raises for a damaged file, besides OSError; RuntimeError for a supposed password or compression.
+# Errors of `zipfile` for a damaged file, besides OSError. Damage that looks like encryption gives RuntimeError.
 ZIP_DAMAGE: Final = (
     *(EOFError, MemoryError, OverflowError, RuntimeError, ValueError),
     *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
 )
-# Errors for a damaged array file; numpy may raise TokenError.
+# Errors that `read_arrays` raises for a damaged file; TokenError is from numpy's parser of the header.
 DAMAGE: Final = (*ZIP_DAMAGE, KeyError, OSError, TypeError, tokenize.TokenError)
-# Field of a line with the CRC-32 of the other fields, written as JSON with sorted keys.
+# Name of the field with the checksum of a JSON line: the CRC-32 of its other fields as JSON with sorted keys.
 CRC: Final = "crc32"
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool) -> None:
-    """Write a new file of named arrays; return once it is on disk."""
+    """Write named arrays to a new .npz file; return once it is on disk."""
     import numpy as np
 
     buffer = io.BytesIO()
@@ -35,7 +35,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool) -> 
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Return the named arrays of a file; raises one of `DAMAGE`."""
+    """Return the named arrays in an .npz file. Raises one of the errors in `DAMAGE` if it is damaged."""
     import numpy as np
 
     with zipfile.ZipFile(io.BytesIO(read_file(path))) as file:
@@ -49,7 +49,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
 
 
 def parse_line(line: str) -> dict[str, Any] | None:
-    """Return the object in a line; None if the line is damaged."""
+    """Return the object in a line made by `line_with_crc`; None if the line is damaged."""
     try:
         content = parsed_json(line)
     except ValueError:
@@ -71,7 +71,7 @@ def append_lines(file: FileIO, begin: int, objects: Sequence[Mapping[str, Any]])
         while content:
             content = content[file.write(content) :]
     except OSError:
-        # An incomplete line would make the line after it unreadable.
+        # an incomplete line would make the next appended line unreadable
         file.truncate(begin)
         raise
 

@@ -1,4 +1,4 @@
-"""Probable causes of badly fitting poses."""
+"""Findings that name the probable cause if single poses fit badly, such as a pulling cable."""
 
 from collections.abc import Sequence
 
@@ -10,22 +10,22 @@ from ftcalib.model import Array
 from ftcalib.routine import MOVED_RAD, DriftCheck, PoseRecord, drift_check, is_return, turned_rad
 
 _SIGNIFICANT = 4.0
-# Findings that report a change between two poses.
+# Codes of findings that report a change of tool or sensor between two poses.
 _CHANGES = {"com_shifted", "load_changed", "bias_stepped", "sensor_turned", "sensor_changed"}
 
 
 def pose_names(records: Sequence[PoseRecord]) -> tuple[str, ...]:
-    """Return names for the rows of a run's dataset: R and the orientation number."""
+    """Return a name for each row of a run's dataset: R and the orientation number, such as "R05"."""
     return tuple(f"R{number:02d}" for number in numbers_in_dataset(records))
 
 
 def numbers_in_dataset(records: Sequence[PoseRecord]) -> tuple[int, ...]:
-    """Return the orientation number of each row of a run's dataset."""
+    """Return the orientation number in the plan for each row of a run's dataset."""
     return tuple(record.pose.number for record in _in_dataset(records))
 
 
 def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Finding, ...]:
-    """Return findings about outlier poses of a tour, most important first; empty without outliers or records.
+    """Return findings about poses of a tour that moved, fit badly or drifted; empty if `records` is.
 
     `result` is the calibration from the dataset of these records, which are in the order of the tour.
     """
@@ -36,7 +36,7 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Fin
     if len(records) != result.n_poses:
         raise ValueError(f"{len(records)} records do not belong to a result of {result.n_poses} poses")
     names, findings = pose_names(records), find_moved(records)
-    if any(finding.code in _CHANGES for finding in result.findings):  # the change explains the outliers
+    if any(finding.code in _CHANGES for finding in result.findings):  # which explains the badly fitting poses
         return tuple(findings)
     odd = [row for row in _out_of_line(result) if _steady(records[row])]
     pulled = [row for row in odd if np.abs(result.residuals[row] / _sigma(result))[:3].max() > _SIGNIFICANT]
@@ -63,7 +63,7 @@ def _steady(record: PoseRecord) -> bool:
 
 
 def find_moved(records: Sequence[PoseRecord]) -> list[Finding]:
-    """Return findings about poses that were not steady; each row of the dataset has one record."""
+    """Return findings about poses that were not steady, or turned during the measurement."""
     findings = []
     for record, name in zip(records, pose_names(records), strict=True):
         turn_rad = turned_rad(record.before, record.after)
@@ -75,21 +75,21 @@ def find_moved(records: Sequence[PoseRecord]) -> list[Finding]:
 
 
 def _out_of_line(result: CalibrationResult) -> list[int]:
-    if "residual_sigma" not in result.quality:  # results for a new tool and updates do not have it
+    if "residual_sigma" not in result.quality:  # missing in updates and results for a new tool
         return []
     spread = np.asarray(result.quality["residual_sigma"], dtype=np.float64)
     return out_of_line(spread, np.ones(len(spread), bool) if result.weights is None else result.weights > 0.5)
 
 
 def _sigma(result: CalibrationResult) -> Array:
-    """Return the noise (6,) at a pose: the measured noise, or the typical residual if that is larger."""
+    """Return the standard deviation (6,) at a pose: the larger of measured noise and typical residual."""
     typical = 1.4826 * np.median(np.abs(result.residuals), axis=0)
     least = np.zeros(6) if result.measured_sigma is None else result.measured_sigma
     return np.maximum(np.maximum(typical, least), 1e-9)
 
 
 def _drifts_alike(result: CalibrationResult, again: DriftCheck) -> bool:
-    """Return whether the drift in the fit is at least half of the largest change of the first pose."""
+    """Return whether the fitted drift explains at least half of the repeated first pose's most significant change."""
     if result.drift is None:
         return False
     k = np.abs(again.change / again.sigma).argmax()

@@ -47,12 +47,12 @@ RUN_FORMAT = "ftdrive.run/1"
 RECORDING_FORMAT = "ftdrive.recording/1"
 log = logging.getLogger(__name__)
 
-# Name of the event `ftdrive.session.events.PoseTaken`.
+# Name of the event `ftdrive.session.events.PoseTaken` in events.ndjson.
 POSE = "pose-taken"
 
 _RESTORE = "restore it from a copy"
 LOCK: Final = "lock"
-# Columns of a recording, named as in `FtSamples`.
+# Arrays of samples in the file of a pose, named as in `FtSamples`.
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 
 # Mode of a session: how the arm moves, or how its motion is recorded.
@@ -63,7 +63,7 @@ IN_MOTION: Final = ("sweep", "passive")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """A state of the arm as read from a recording."""
+    """State of the arm before or after the samples of a pose, as read from its file."""
 
     t_host_ns: int
     q_rad: Array
@@ -93,7 +93,7 @@ class Run(Displayed):
 
     def __init__(self, folder: str | Path, clock: Clock = REAL) -> None:
         self.folder = Path(folder)
-        self._clock_offset_ns = time.time_ns() - clock.now_ns()  # offset from host times in the files to UTC
+        self._clock_offset_ns = time.time_ns() - clock.now_ns()  # UTC minus host time
         self._events_lock = threading.Lock()
         self._held = ExitStack()
 
@@ -159,17 +159,17 @@ class Run(Displayed):
 
     @property
     def calibration_path(self) -> Path:
-        """Path of the newest result."""
+        """Path of the newest calibration.json, calibration-2.json and so on; it may not exist."""
         return newest_path(self.folder / "calibration.json")
 
     @property
     def dataset_path(self) -> Path:
-        """Path of the newest dataset."""
+        """Path of the newest dataset.json, dataset-2.json and so on; it may not exist."""
         return newest_path(self.folder / "dataset.json")
 
     @property
     def motion_path(self) -> Path:
-        """Path of the newest recording in motion: a file, or a folder with the parts."""
+        """Path of the newest recording in motion: a file, or a folder with its parts; it may not exist."""
         folder = self.folder / "motion"
         return folder if folder.is_dir() else newest_path(self.folder / "motion.npz")
 
@@ -180,7 +180,7 @@ class Run(Displayed):
 
     @property
     def plan_path(self) -> Path:
-        """Path of the plan."""
+        """Path of plan.json; it does not exist if the operator moved the arm."""
         return self.folder / "plan.json"
 
     @property
@@ -190,7 +190,7 @@ class Run(Displayed):
 
     @property
     def mode(self) -> "Mode":
-        """Mode of the session. Raises `BadDataset`."""
+        """Mode of the session that made the run. Raises `BadDataset` if run.json is damaged."""
         mode: Mode = self.header().get("mode", "auto")
         return mode
 
@@ -201,14 +201,14 @@ class Run(Displayed):
 
     @property
     def how_to_go_on(self) -> str:
-        """Instruction for a run that has too few data for a result. Raises `BadDataset`."""
+        """What to do if the run has too few data for a result: resume it, or start again if it is in motion."""
         if self.mode in IN_MOTION:
             return f"start again with --{self.mode}, because a recording in motion cannot be resumed"
         return f"continue it with {self.resume_command}"
 
     @property
     def method(self) -> Method:
-        """Method by which the poses are solved."""
+        """Calibration method by which the poses of the run are solved, such as "ml"."""
         method: Method = self.header().get("method", "ml")
         return method
 
@@ -219,18 +219,18 @@ class Run(Displayed):
         return f"ftdrive solve {shlex.quote(str(self.folder))}{with_it}"
 
     def new_path(self, name: str, ending: str = ".json") -> Path:
-        """Return the next unused path for a name: name.json, name-2.json and so on."""
+        """Return the first unused path of name.json, name-2.json and so on in the run folder."""
         return unused_path(self.folder / f"{name}{ending}")
 
     def append_event(self, event: Mapping[str, Any], *, sync: bool = False) -> None:
-        """Append a line to events.ndjson; with `sync`, return once it is on disk. Any thread may call this method."""
+        """Append an event to events.ndjson; with `sync`, return once it is on disk. Any thread may call this method."""
         with self._events_lock, self._events_path.open("ab", buffering=0) as file:
             append_lines(file, file.tell(), [event])
             if sync:
                 os.fsync(file.fileno())
 
     def events(self) -> Iterator[Mapping[str, Any]]:
-        """Yield the events of the run; an incomplete last line is ignored. Raises `BadDataset` for other damage."""
+        """Yield the events in events.ndjson. An incomplete last line is ignored; other damage raises `BadDataset`."""
         path = self._events_path
         text = read_file(path).decode(errors="replace") if path.exists() else ""
         *lines, rest = text.split("\n")
@@ -238,7 +238,7 @@ class Run(Displayed):
             if (event := parse_line(line)) is None:
                 raise BadDataset(f"{path}: line {number} is damaged: {_RESTORE}")
             yield event
-        # The remainder is an event if only its newline is missing or damaged.
+        # The last line is an event if only its newline is missing or damaged.
         if (event := parse_line(rest) or parse_line(rest[:-1])) is not None:
             yield event
 
@@ -247,12 +247,12 @@ class Run(Displayed):
         return self.folder / "events.ndjson"
 
     def _remove_incomplete_event(self) -> None:
-        """Remove an incomplete last line after a power failure, so that the next event starts a new line."""
+        """Remove a last line of events.ndjson that a power failure cut short, so that the next event is readable."""
         if self._events_path.exists():
             os.truncate(self._events_path, read_file(self._events_path).rfind(b"\n") + 1)
 
     def temperature_C(self) -> float | None:
-        """Return the sensor's mean temperature over the poses, °C; None if it reported none."""
+        """Return the sensor's mean temperature over the poses, °C; None if the sensor reported no temperature."""
         by_stop = {
             event.get("stop"): event.get("temperature_C") for event in self.events() if event.get("event") == POSE
         }
@@ -278,7 +278,7 @@ class Run(Displayed):
         """Return the contents of run.json; also raises `BadDataset` if the plan of the run is missing."""
         header = self.header()
         for section, key in (("robot", "host"), ("sensor", "url")):
-            header["config"][section][key]  # a missing entry raises an error here
+            header["config"][section][key]  # raise `BadDataset` if it is missing
         if self.mode in ("auto", "step") and not self.plan_path.is_file():
             raise BadDataset(
                 f"{self.plan_path} is missing, and without its plan the run cannot be resumed: {_RESTORE}, or solve "
@@ -287,7 +287,7 @@ class Run(Displayed):
         return header
 
     def commit(self, record: PoseRecord) -> PoseRecord:
-        """Write a pose; once it is on disk, return it as `records` would read it."""
+        """Write a pose to a new file; once it is on disk, return it with its clock offset, as `records` reads it."""
         record = replace(record, clock_offset_ns=record.clock_offset_ns or self._clock_offset_ns)
         readings: dict[str, Any] = {
             f"{when}_{name}": np.asarray(getattr(reading, name))
@@ -309,11 +309,11 @@ class Run(Displayed):
         return record
 
     def records(self) -> list[PoseRecord]:
-        """Return every pose in the order of the tour; only the newest version of a pose taken again."""
+        """Read all poses in the order of the tour; for a pose that was taken again, only the newest."""
         return [_read_pose_record(newest_path(self.folder / "poses" / f"{stop:02d}.npz")) for stop in self.stops()]
 
     def stops(self) -> list[int]:
-        """Return the stops that have a pose, without reading the poses."""
+        """Return the numbers of the stops with a stored pose, by the names of their files."""
         names = {path.stem.partition("-")[0] for path in (self.folder / "poses").glob("*.npz")}
         return sorted(int(name) for name in names if name.isdecimal())
 
@@ -324,7 +324,7 @@ _TEXT_OR_NULL: _Kind = "a string or null", lambda value: isinstance(value, str |
 _TEXTS: _Kind = "a list of strings", lambda value: isinstance(value, list) and all(map(_TEXT[1], value))
 _OBJECT: _Kind = "an object", lambda value: isinstance(value, dict)
 _OBJECTS: _Kind = "an object of objects", lambda value: _OBJECT[1](value) and all(map(_OBJECT[1], value.values()))
-# Types of the fields of run.json; `read_recorded` checks those of config.
+# Types of the fields of run.json; `read_recorded` checks the fields of its section config.
 _KINDS: Mapping[str, _Kind] = {
     "config": _OBJECTS,
     "command": _TEXT,
@@ -357,7 +357,7 @@ def _require_kinds(header: Mapping[str, Any]) -> None:
 
 
 class _Whole(dict[str, Any]):
-    """A JSON object in run.json; a missing key raises `BadDataset`, which names the file."""
+    """A JSON object in run.json. A key that it lacks raises `BadDataset`, whose message names the file and the key."""
 
     def __init__(self, path: Path, content: Mapping[str, Any]) -> None:
         super().__init__(

@@ -37,7 +37,7 @@ from ftdrivers.ur.kinematics import MODELS, model_named
 
 
 class RecordedRun:
-    """Arm and sensor played back from records, for `ftcalib.routine`; nothing moves or waits."""
+    """Arm and sensor for `ftcalib.routine` that play back the records of a run; nothing moves or waits."""
 
     def __init__(self, records: Sequence[PoseRecord]) -> None:
         self._records = list(records)
@@ -51,7 +51,7 @@ class RecordedRun:
             raise ValueError(f"stop {self._stop + 1} of the recording does not have the joint angles of the routine")
 
     def wait_until_still(self, **_: object) -> None:
-        """Return at once, and start the measurement of a pose."""
+        """Return at once, because a recorded arm is still; `state` is then again the one before the samples."""
         self._collected = False
 
     def state(self) -> ArmReading:
@@ -60,12 +60,12 @@ class RecordedRun:
         return record.after if self._collected else record.before
 
     def collect(self, _duration_s: float, /) -> WrenchSamples:
-        """Return the samples of this stop."""
+        """Return the recorded samples of this stop, whatever duration is requested."""
         self._collected = True
         return self._records[self._stop].samples
 
     def check(self) -> None:
-        """Do nothing: a recording cannot fail."""
+        """Do nothing, because recorded devices cannot fail."""
 
 
 _UNDESCRIBED: Final = Setup()
@@ -78,24 +78,24 @@ class SolveOptions:
     method: str = "ml"
     """A `ftcalib.result.Method`, or "all" to compare the methods."""
     orientation: Orientation = "R_base_flange"
-    """Direction of the rotations in a CSV file."""
+    """Direction of the rotations in a table: flange to base coordinates, or the inverse."""
     drift: Drift = "auto"
     known: Known | None = None
-    """Known values. A known direction of gravity means that the base is level with respect to its mounting."""
+    """Values that the user declares known; a known gravity direction here only means a base level to its mounting."""
     up_in_base: Sequence[float] | None = None
-    """(3,) declared up direction in base axes, which replaces the direction given by the mounting of a run."""
+    """(3,) up direction in base axes from `--up`, which replaces the direction from the mounting of a run."""
     as_published: bool = False
     earlier: CalibrationResult | None = None
     """Earlier result, from which a new tool takes mounting, gravity direction and gain."""
     pair: tuple[Path, Path] | None = None
-    """Files of wrench and orientation, which together are a recording in motion."""
+    """Files with the wrench and with the orientation, which together are one recording in motion."""
     point_mass: bool = False
     topics: tuple[str | None, str | None] = (None, None)
-    """Topics of a ROS bag: wrench and pose."""
+    """Topics of wrench and pose in a ROS bag; None if the bag has only one of the type."""
     table: TableOptions | None = None
-    """Facts about another program's table; None if there are none."""
+    """Facts that a table of another program lacks; None if no option gives any."""
     words: tuple[str, ...] = ()
-    """These options as typed, quoted for a shell."""
+    """The options as words of a command line, quoted for a shell."""
 
     @classmethod
     def of_solve(  # noqa: PLR0913 - the options of the command
@@ -123,7 +123,7 @@ class SolveOptions:
         output: Path | None,
         simulate: bool,
     ) -> Self:
-        """Return the parsed options of `ftdrive solve`; raises `ConfigError` if they contradict each other."""
+        """Parse the options of `ftdrive solve`. Raises `ConfigError` if they are invalid or contradict each other."""
         if (wrench is None) != (orientation_file is None) or (wrench is not None and sources):
             raise ConfigError("--wrench and --orientation-file are parts of one recording: give both, and no DATASET")
         pair = None if wrench is None or orientation_file is None else (wrench, orientation_file)
@@ -163,7 +163,7 @@ class SolveOptions:
 
 
 def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: str | None) -> Known | None:
-    """Return the values that the options declare known; None if there are none. Raises `ConfigError`."""
+    """Return the values that the options declare known; None without such options. Raises `ConfigError` if invalid."""
     if mass_kg is None and level_deg is None and mounting_deg is None:
         return None
     R_flange_sensor = None
@@ -182,7 +182,7 @@ def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: s
 
 
 def up_direction(up: str | None) -> list[float] | None:
-    """Return the direction (3,) given by `--up`; None without it. Raises `ConfigError`."""
+    """Return the direction (3,) given by `--up`; None without the option. An invalid one raises `ConfigError`."""
     if up is None:
         return None
     direction = parse_numbers("--up", up, ",", (3,))
@@ -204,7 +204,7 @@ def table_options(
     model: str | None,
     urdf: str | None,
 ) -> TableOptions:
-    """Return those options of a command that describe a table. Raises `ConfigError` or `OSError`."""
+    """Parse the options that describe a table. Raises `ConfigError` if one is invalid, `OSError` for a missing file."""
     offset = [0.0] * 6 if tcp is None else parse_numbers("--tcp", tcp, ",", (3, 6))
     turn = [*offset, 0.0, 0.0, 0.0][3:6]
     named, text = ({}, {}) if columns is None else _named_columns(columns)
@@ -223,7 +223,7 @@ def table_options(
 
 
 def _named_columns(text: str) -> tuple[Mapping[str, str], Mapping[str, Any]]:
-    """Return the columns by signal from an option or a TOML file, and the `text` section of the file."""
+    """Parse `--columns`, a list or a TOML file: return the columns by ftdrive's names, and the file's `[text]`."""
     if text.endswith(".toml"):
         try:
             document = tomllib.loads(read_file(text).decode())
@@ -240,7 +240,7 @@ def _named_columns(text: str) -> tuple[Mapping[str, str], Mapping[str, Any]]:
 
 
 def _forward(model: str | None, urdf: str | None) -> Callable[[Array], tuple[Array, Array]] | None:
-    """Return the forward kinematics of joint angles (n, 6); None without a model or URDF."""
+    """Return the function from joint angles (n, 6) to flange poses of a model or a URDF; None without either."""
     if model is not None and urdf is not None:
         raise ConfigError("--model and --urdf both describe the arm: leave one out")
     if urdf is not None:
@@ -279,16 +279,16 @@ def _load_chain(urdf: str) -> Chain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedData:
-    """Poses at rest, with everything that is known about them."""
+    """Poses at rest from a run, a dataset or a table, with the other inputs of the solver."""
 
     dataset: CalibrationDataset
     provenance: dict[str, Any]
     g_m_s2: float = STANDARD_GRAVITY_M_S2
     setup: Setup = _UNDESCRIBED
-    """The described cell."""
+    """Description of the cell by which the result is judged; empty for a dataset or table."""
     known: Known | None = None
     records: Sequence[PoseRecord] = ()
-    """Records of a run; empty for other sources."""
+    """The poses with their samples if they are from a run; empty for other sources."""
     earlier: CalibrationResult | None = None
     """Earlier result, from which a new tool takes mounting, gravity direction and gain."""
 
@@ -329,7 +329,7 @@ class RecordedData:
 
 
 def read_source(source: Path, options: SolveOptions) -> RecordedData:
-    """Read poses from a run folder, dataset.json or table. Raises `BadDataset`, `ConfigError` or `OSError`."""
+    """Read poses at rest from a run folder, dataset.json or table. Unusable data raise `BadDataset`."""
     known = options.known
     if source.is_dir():
         run = Run(source)
@@ -345,7 +345,7 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
         data = RecordedData(dataset, {"source": source.name, **recognised, "versions": versions()})
         if table.has_nominal_kinematics:
             data = replace(data, setup=replace(data.setup, orientation_accuracy_deg=NOMINAL_ORIENTATION_DEG))
-        if table.gravity_is_measured:  # the direction of gravity defines the base
+        if table.gravity_is_measured:  # the base is defined by gravity
             known = replace(known or Known(), gravity_direction_base=-UP_IN_BASE)
     if options.table is not None and (source.is_dir() or source.suffix == ".json"):
         raise ConfigError(f"{source.name} is not a table: leave out options for tables, such as --columns")
@@ -362,10 +362,10 @@ _TAKEN: Final = "give a path, a DataFrame, arrays by name, or a pair (R_base_fla
 
 
 def as_source(source: Any) -> Any:
-    """Return a dataset, a recording, or a Path, DataFrame or mapping that may be either, from a user's argument.
+    """Convert a user's argument to a dataset, a recording, or a Path, DataFrame or mapping with either.
 
-    A pair has R_base_flange (n, 3, 3), or n Rotations, and the wrenches (n, 6), N and N·m. Raises `BadDataset` for
-    arrays of other shapes, and for other arguments `TypeError`, whose message names the right call.
+    A pair of R_base_flange (n, 3, 3), or n Rotations, and wrenches (n, 6), N and N·m, is a dataset. Raises `BadDataset`
+    for arrays of other shapes, and for other arguments `TypeError`, whose message names the right call.
     """
     if isinstance(source, str):
         return Path(source)
@@ -429,7 +429,7 @@ def read_dataset(
 def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any]) -> None:
     """Raise `ConfigError` if an earlier result cannot be used for a new tool: it is rejected or from a different cell.
 
-    Sensor, arm and mount are compared if both sides name them.
+    Sensor, arm and mount are compared if both `earlier` and `provenance` name them.
     """
     if earlier.verdict == "rejected":
         raise ConfigError(f"--from: result {earlier.id} is rejected: give an accepted one")
@@ -447,22 +447,22 @@ def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Circumstances:
-    """Facts about the data of a run, taken from its header and events."""
+    """What the solver needs besides the data of a run, from its run.json and events."""
 
     g_m_s2: float
     setup: Setup
-    """The described cell."""
+    """Description of the cell by which the result is judged."""
     origin: dict[str, Any]
-    """Devices, run, cell and temperature."""
+    """Provenance of the data: devices, run, description of the cell, temperature, load."""
 
     def provenance(self) -> dict[str, Any]:
-        """Return the provenance for a result that is made now."""
+        """Return the provenance for a result that is solved now, with time, command line and versions."""
         return {**made_now(), **self.origin}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """A solved run."""
+    """A run with its result."""
 
     run: Run
     dataset: CalibrationDataset | None
@@ -472,8 +472,8 @@ class Outcome:
 
 
 def solve_and_save(run: Run) -> Outcome:
-    """Solve a run and save dataset and result; raises `OSError` if they cannot be saved."""
-    # The data come from the files, not from memory, so that a replay gives the same result to the last digit.
+    """Solve a run, and save its dataset and, unless rejected, the result. Raises `OSError` if that fails."""
+    # Read the data from the files even right after a session, so that a replay gives exactly the same result.
     outcome = Outcome(run, None, solve_in_motion(run), None) if run.in_motion else solve_records(run, run.records())
     try:
         if outcome.dataset is not None:
@@ -492,7 +492,7 @@ def solve_and_save(run: Run) -> Outcome:
 def solve_in_motion(
     run: Run, known: Known | None = None, *, earlier: CalibrationResult | None = None, point_mass: bool = False
 ) -> CalibrationResult:
-    """Solve a run in motion; with an earlier result, given or recorded in the run, solve only for a new tool."""
+    """Solve a run in motion; with an earlier result, given here or stored in the run, solve only for a new tool."""
     circumstances, earlier = circumstances_of(run), earlier or _earlier_of(run)
     if earlier is not None:
         require_same_cell(earlier, circumstances.origin)
@@ -516,13 +516,13 @@ def solve_in_motion(
 
 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
-    """Return the outcome of a run for its records, or for those of a replay."""
+    """Solve the poses `records`, which are those stored in the run, or those of a replay of the run."""
     data = _recorded_data(run, records)
     return Outcome(run, data.dataset, data.solve(run.method), drift_check(records))
 
 
 def _earlier_of(run: Run) -> CalibrationResult | None:
-    """Return the result that gives mounting, base and gain to a new tool's run; None for any other run."""
+    """Return the earlier result in run.json, from which a run for a new tool takes mounting, base and gain, or None."""
     document = run.header().get("earlier")
     return None if document is None else CalibrationResult.from_dict(document)
 
@@ -541,16 +541,16 @@ def _recorded_data(run: Run, records: Sequence[PoseRecord]) -> RecordedData:
 
 
 def circumstances_of(run: Run) -> Circumstances:
-    """Return the facts that `solve` needs in addition to the data of a run; the data are not read.
+    """Return what the solver needs besides the data of a run, without reading the data.
 
-    A tool with a load gets another name, so that its result is not used for the tool alone.
+    A tool with a load gets a name of its own, so that the result is not used for the tool alone.
     """
     header = run.header()
     config, load = header["config"], Load.of_header(header)
     sensor, tool, workcell, robot = (config.get(name, {}) for name in ("sensor", "tool", "workcell", "robot"))
     payload_kg = p_flange_payload_m = None
     for event in run.events():
-        if event.get("event") == "weighed":  # the last event is used
+        if event.get("event") == "weighed":  # the last one counts
             payload_kg, p_flange_payload_m = event["payload_kg"], event.get("p_flange_payload_m")
     tool_kg, mounting, height_mm = tool.get("mass_kg"), workcell.get("mounting"), sensor.get("height_mm")
     tool_kg = tool_kg + load.mass_kg if load and tool_kg else tool_kg
@@ -558,7 +558,7 @@ def circumstances_of(run: Run) -> Circumstances:
     # With a load, the centre of mass may lie outside the tool's cylinders.
     cylinders_mm = [list(row) for row in tool.get("cylinders_mm", ())] if workcell.get("measured") and not load else []
     ranges = [sensor["range_N"], sensor["range_Nm"]] if sensor.get("range_N") and sensor.get("range_Nm") else None
-    # Facts to which a result is bound, or against which it is compared.
+    # Description of the cell in the provenance of a result, for later comparison with other cells and results.
     described = {
         "payload_kg": payload_kg,
         "p_flange_payload_m": p_flange_payload_m,

@@ -22,7 +22,7 @@ from ftcalib.errors import BadCalibration, BadDataset, NotObservable
 from ftcalib.files import JSON, check_format, object_of, read_file, write_object
 from ftdrive.runs.calibration import at, made_now, marks_of, number_at, numbers_at, text_at, time_at
 
-# Listing results must not import numpy.
+# Only for type checkers: listing results must not import numpy, which takes long.
 if TYPE_CHECKING:
     from ftcalib import CalibrationDataset, CalibrationResult
     from ftcalib.after.state import Update
@@ -32,56 +32,56 @@ if TYPE_CHECKING:
     from ftdrive.runs.run import Run
 
 FORMAT: Final = "ftdrive.verification/1"
-# Largest allowed differences of force, N, and torque, N·m. If one is given, the limits replace the statistical test.
+# Limits of the differences in force, N, and torque, N·m; None is no limit. If given, they replace the statistical test.
 Limits = tuple[float | None, float | None]
 NO_LIMITS: Final = None, None
 # False-alarm rate: share of the verifications of an unchanged cell that fail.
 FALSE_ALARMS: Final = 0.01
-# Number of leading fields of a verification that a recording stores.
+# A recording stores this number of fields of a `VerificationRecord`, the first ones.
 _RECORDED: Final = 8
-# Parts of a calibration's provenance that an update keeps.
+# Fields that an update copies from the provenance of the updated calibration.
 _COPIED: Final = ("devices", "station", "setup", "edited")
 
 
 class VerificationRecord(NamedTuple):
-    """Outcome of a calibration's verification; a tuple, because a fleet reads 20,000 of them per minute."""
+    """Outcome of a verification; a tuple for speed, because a fleet's store reads 20,000 of them per minute."""
 
     path: str
     """Path of verification.json in its run folder."""
     calibration_id: str
     created_utc: str | None
-    """UTC in ISO 8601 with microseconds, which sorts as text; None if the file has no time."""
+    """Time of the verification, UTC, ISO 8601 with microseconds (sorts as text); None if the file has no time."""
     passed: bool
     change: str | None
-    """Change that explains the readings, such as "bias"; None without a change or an explanation."""
+    """Change since the calibration that explains the readings, such as "bias"; None if there is none or none fits."""
     reason: str | None
-    """Why the verification failed."""
+    """Why the verification failed; None if it passed."""
     force_max_N: float | None = None
     torque_max_Nm: float | None = None
-    """Largest differences of force and torque; not in the store."""
+    """Largest differences between measured and predicted force and torque; the store does not have them."""
     id: str = ""
     """First 12 hex digits of the SHA-256 of the file; this and the following fields are unset in a recording."""
     temperature_C: float | None = None
     bias_change: Sequence[float] | None = None
     """(6,) change of the bias since the calibration, N and N·m, sensor axes."""
     bias_change_sigma: Sequence[float] | None = None
-    """(6,) standard deviation of the change of the bias, from the readings of this verification."""
+    """(6,) standard deviation of `bias_change` due to the noise of this verification's readings."""
     calibration_sigma: Sequence[float] | None = None
-    """(6,) standard deviation of the change of the bias, from the calibration, common to all its verifications."""
+    """(6,) standard deviation of `bias_change` due to the calibration, common to all verifications of it."""
 
     @property
     def run(self) -> str:
-        """Name of the run folder."""
+        """Name of the run folder of the verification."""
         return Path(self.path).parent.name
 
     @property
     def shows_bias(self) -> bool:
-        """Whether the estimated change of the bias is valid; another change or a contact invalidates it."""
+        """Whether `bias_change` is valid, because no other change and no contact was found."""
         return self.passed or self.change == "bias"
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a verification.json, ignoring unknown fields. Raises `BadCalibration` or `OSError`."""
+        """Read a verification.json, ignoring unknown fields. Raises `BadCalibration` if it is damaged."""
         content = read_file(path)
         document = object_of(content, BadCalibration)
         check_format(document, FORMAT, BadCalibration)
@@ -92,7 +92,7 @@ class VerificationRecord(NamedTuple):
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Return the verification that a recording stores, ignoring unknown fields. Raises `BadCalibration`."""
+        """Build the record from the fields in a recording. Raises `BadCalibration` if the id or outcome is missing."""
         path, calibration_id = str(document.get("path")), text_at(document, "calibration_id")
         largest = number_at(document, "force_max_N"), number_at(document, "torque_max_Nm")
         passed = document.get("passed")
@@ -104,7 +104,7 @@ class VerificationRecord(NamedTuple):
         return cls(path, calibration_id, made, passed, change, text_at(document, "reason"), *largest)
 
     def to_dict(self, names: Sequence[str] = ()) -> dict[str, Any]:
-        """Return named fields as JSON, by default those of streams and recordings; `run` is also allowed."""
+        """Return the named fields as JSON, by default those that recordings store; `run` is also a name."""
         values = {**self._asdict(), "run": self.run}
         return {name: values[name] for name in names or self._fields[:_RECORDED]}
 
@@ -118,8 +118,8 @@ class VerificationRecord(NamedTuple):
 
 
 def verification_near(place: Path, calibration_id: str) -> VerificationRecord | None:
-    """Return the newest verification of a calibration, given its file or run folder; None if there is none."""
-    # Searched by id, because the calibration's own run folder is complete and gets no more files.
+    """Return a calibration's newest verification, searched near its file or run folder `place`; None if none exists."""
+    # Search other run folders by id, because a verification adds no file to the calibration's own run folder.
     folder, records = place.absolute() if place.is_dir() else place.absolute().parent, list[VerificationRecord]()
     for parent in dict.fromkeys((folder.parent, folder / "runs", Path("runs").absolute())):
         for file in sorted(parent.glob("*/verification*.json")):
@@ -129,13 +129,13 @@ def verification_near(place: Path, calibration_id: str) -> VerificationRecord | 
 
 
 def newest(records: Iterable[VerificationRecord]) -> VerificationRecord | None:
-    """Return the newest verification; None if none has a time."""
+    """Return the newest of some verifications; None if none of them has a time."""
     timed = (record for record in records if record.created_utc is not None)
     return max(timed, key=lambda record: record.created_utc or "", default=None)
 
 
 def fitted_dataset(calibration: "CalibrationResult", place: Path) -> "CalibrationDataset | None":
-    """Return the poses of a calibration, next to its file or in its folder `place`; None if they are missing."""
+    """Return the dataset from which a calibration was solved, from the folder of its file; None if it is not there."""
     for path in sorted((place if place.is_dir() else place.parent).glob("dataset*.json")):
         with suppress(BadDataset, OSError):
             dataset = ftcalib.CalibrationDataset.load(path)
@@ -145,7 +145,7 @@ def fitted_dataset(calibration: "CalibrationResult", place: Path) -> "Calibratio
 
 
 def age_in_words(age: timedelta) -> str:
-    """Return an age as text, in minutes, hours or days."""
+    """Return an age as text in minutes, hours or days, such as "3 h"."""
     hours = max(0.0, age.total_seconds()) / 3600
     return f"{hours * 60:.0f} min" if hours < 1 else f"{hours:.0f} h" if hours < 48 else f"{hours / 24:.0f} d"
 
@@ -159,7 +159,7 @@ def age_and_check(calibration: "CalibrationResult", last: VerificationRecord | N
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verified:
-    """A verification run with its comparison to the calibration."""
+    """A run of `ftdrive verify`, and the comparison of its poses with the calibration."""
 
     run: "Run"
     calibration: "CalibrationResult"
@@ -167,7 +167,7 @@ class Verified:
     limits: Limits
     dataset: "CalibrationDataset"
     records: "tuple[PoseRecord, ...]"
-    """One record per row of the dataset."""
+    """The poses with their samples, one per row of the dataset."""
     verification: "Verification"
     drift: "DriftCheck | None"
     path: Path
@@ -175,12 +175,12 @@ class Verified:
 
     @property
     def force_N(self) -> "Array":
-        """(n,) norm of the force difference at each pose."""
+        """(n,) norm of the difference between measured and predicted force at each pose."""
         return self._differences(slice(3))
 
     @property
     def torque_Nm(self) -> "Array":
-        """(n,) norm of the torque difference at each pose."""
+        """(n,) norm of the difference between measured and predicted torque at each pose."""
         return self._differences(slice(3, 6))
 
     def _differences(self, axes: slice) -> "Array":
@@ -195,7 +195,7 @@ class Verified:
 
     @property
     def exceeded(self) -> tuple[str, ...]:
-        """Descriptions of the limits that a pose exceeds, with the values."""
+        """Texts about the limits on the command line that the largest difference exceeds, with the values."""
         largest = (self.force_N, "--max-force", "N"), (self.torque_Nm, "--max-torque", "N·m")
         return tuple(
             f"{sizes.max():.3g} {unit} is above {option} {limit:g} {unit}"
@@ -205,17 +205,17 @@ class Verified:
 
     @property
     def failure(self) -> str:
-        """Why the verification failed."""
+        """Why the verification failed; empty if it passed."""
         return self.verification.reason if self.limits == NO_LIMITS else "; ".join(self.exceeded)
 
     @property
     def marks(self) -> tuple[str, ...]:
-        """Marks of the calibration, and the mark of an emulated cell."""
+        """Warning marks of the calibration, see `MARKS`, including that of a run in an emulated cell."""
         return marks_of(self.calibration, emulated=self.run.header().get("station") is not None)
 
     @property
     def update(self) -> "Update | None":
-        """The smallest sufficient update; None if none is needed, or if only a new calibration helps."""
+        """Smallest update of the calibration that explains the poses; None if not needed or not sufficient."""
         return self.verification.update
 
     def next_command(self, saved: Path | None, again: str = "") -> str:
@@ -228,7 +228,7 @@ class Verified:
 
     @property
     def updated(self) -> str:
-        """Description of the values that the update replaces."""
+        """Text that names the values that the update replaces, such as "the bias"."""
         kind = None if self.update is None else self.update.kind
         return "all values" if kind == "all" else f"the {kind}"
 
@@ -309,9 +309,9 @@ def verify_run(run: "Run", calibration: "CalibrationResult", path: Path, limits:
 
 
 def save_update(verified: Verified) -> Path:
-    """Save the update as a new calibration in the run folder of the verification, and return its path.
+    """Save the updated calibration in the run folder of the verification, and return its path.
 
-    Its provenance names the parent. Raises `NotObservable` if the verification has no update.
+    Its provenance names the old calibration as parent. Raises `NotObservable` if the verification has no update.
     """
     from ftcalib.after.state import apply_update
 

@@ -23,21 +23,21 @@ from ftdrive.runs.numbers import append_lines, parse_line
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
 FILES: Final = "weighings-*.ndjson"
-# Reasons without a mass: the codes of `ftdrive.stream.weighing.WORDS`. Each code is a column of the store, so a
-# change must increase `ftdrive.store.database.SCHEMA`.
+# Codes of the reasons why a weighing gave no mass, see `ftdrive.stream.weighing.WORDS`. Each is a column of the store,
+# so a change must increase `ftdrive.store.database.SCHEMA`.
 REFUSALS: Final = (
     *("samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "undecided", "count"),
-    "other",  # stands for every code from a newer version
+    "other",  # every code that this version does not know
 )
-# Number of bytes at the end of a file that always include a line end, even after a power failure.
+# Number of bytes at the end of a file in which the last line end is searched; no line is as long.
 _TAIL: Final = 1 << 16
 
 
 def append_weighings(folder: Path, origin: Mapping[str, JSON], day: str, lines: Sequence[Mapping[str, JSON]]) -> Path:
-    """Append lines to the file of a day (ISO 8601), and return its path once they are on disk.
+    """Append weighings to the file of a day (ISO 8601), and return its path once they are on disk.
 
-    `origin` has the other fields of the header. Other programs may append lines at the same time. Raises `OSError`; the
-    file is then unchanged.
+    `origin` has the other fields of the file's first line. Other programs may append at the same time. If that fails,
+    raises `OSError` and leaves the file without the new lines.
     """
     import fcntl
 
@@ -66,10 +66,10 @@ class WeighingDay:
     """The weighings on one day (UTC) with one calibration on one arm: one file, or the sum of several files."""
 
     id: str
-    """Name of the file without its extension."""
+    """Name of the weighing file without its extension."""
     path: str
     day: str = ""
-    """Day in ISO 8601."""
+    """Day (UTC) in ISO 8601."""
     tool: str | None = None
     arm_serial: str | None = None
     sensor_serial: str | None = None
@@ -77,11 +77,11 @@ class WeighingDay:
     calibration_id: str | None = None
     emulated: bool = False
     size: int = 0
-    """Number of bytes read so far; further bytes in the file are new."""
+    """Number of bytes of the file that are included here; later bytes are new lines."""
     weighings: int = 0
     """Number of weighed parts; weighings of an empty gripper do not count."""
     refusals: Mapping[str, int]
-    """Numbers of attempts without a mass, by the codes of `REFUSALS`."""
+    """Numbers of weighings that gave no mass, by the reason, a code in `REFUSALS`."""
     last_utc: str | None = None
     """Time at which the last part was weighed."""
     mass_kg: float | None = None
@@ -116,7 +116,7 @@ class WeighingDay:
                 elif (code := content.get("refused")) is not None:
                     refusals[code if code in refusals else "other"] += 1
                 elif content.get("is_something"):
-                    weighings += not content.get("poses", 1) > 1  # further poses of the same part
+                    weighings += not content.get("poses", 1) > 1  # further poses of one part do not count
                     last = content
                 size += len(line)
         if not size:
@@ -128,7 +128,7 @@ class WeighingDay:
 
 
 def sum_up(days: Iterable[WeighingDay]) -> list[WeighingDay]:
-    """Return the totals of the last day of each tool and arm, with its last weighing, the oldest first."""
+    """Return for each tool and arm its last day with weighings: the sum over that day's files, the oldest day first."""
     last = dict[tuple[object, ...], WeighingDay]()
     for part in sorted(days, key=lambda part: (part.day, part.last_utc or "", part.id)):
         key = (part.tool, part.arm_serial, part.robot_host, part.emulated)

@@ -1,1 +1,1 @@
-"""Reading of tables from other programs: text formats, columns and units."""
+"""Reading of tables from other programs: recognition of their text formats, columns and units."""

@@ -1,4 +1,4 @@
-"""Recognition of the signals in the columns of a table, and of the units."""
+"""Recognition of the signals in a table (time, wrench, orientation) and their units by the names of the columns."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +12,7 @@ from ftcalib.judge.units import FORCE_UNITS_N, TORQUE_UNITS_NM
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 
 _DEG = 0.017453292519943295
-# Factors to SI units by quantity; the names of the units have no spaces, dots, `·`, `*`, `-` or `^`.
+# Factors to SI units by quantity and unit; units are written without spaces, dots, `·`, `*`, `-` and `^`.
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "time": {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
     "force": {**FORCE_UNITS_N, "kg": FORCE_UNITS_N["kgf"], "lb": FORCE_UNITS_N["lbf"]},
@@ -37,7 +37,7 @@ _SUFFIXES: Final = frozenset(
 
 
 class Layout(NamedTuple):
-    """Names that one program gives to the columns."""
+    """Names that one program gives to the columns of its tables."""
 
     program: str
     signals: Mapping[str, str]
@@ -49,7 +49,7 @@ class Layout(NamedTuple):
 
 
 _UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-# One entry per program. If several entries match a file, the one with the most matching columns has priority.
+# Column names of each program. If several programs match a table, the one with the most matching columns has priority.
 LAYOUTS: Final = (
     Layout(
         "ftdrive",
@@ -140,13 +140,13 @@ LAYOUTS: Final = (
 
 
 class Signal(NamedTuple):
-    """The columns of one signal."""
+    """The columns of a table that contain one signal."""
 
     form: str
     program: str
     columns: Sequence[int]
     units: Sequence[str]
-    """Unit of each column as in the header; empty without a unit."""
+    """Unit of each column as written in the header; empty if the header has none."""
 
 
 class SignalColumns:
@@ -193,7 +193,7 @@ class SignalColumns:
         self._layouts = [layout for *_, layout in sorted(ranked, reverse=True, key=lambda one: one[:2])]
 
     def find(self, *signals: str) -> Signal | None:
-        """Return the first of some signals that the table has, else None. Raises `BadDataset` for two candidates."""
+        """Return the first of `signals` in the table, else None. Raises `BadDataset` if two sets of columns match."""
         two, line = list[str](), ""
         for layout, signal in product(self._layouts, signals):
             for way in layout.signals.get(signal, "").split("|"):
@@ -204,7 +204,7 @@ class SignalColumns:
                 if candidates and not two:
                     two = [self.names[one[0][0]] for one in candidates]
                     line = self.line(signal)
-        if two and signals != ("time",):  # two topics have time stamps besides the file's own clock
+        if two and signals != ("time",):  # two time columns are no error: each topic has stamps
             raise BadDataset(f"two candidates, {' and '.join(two[:2])}. Name the columns: {line}")
         return None
 
@@ -213,7 +213,7 @@ class SignalColumns:
         return any(self._nearest(layout, signal)[0] for layout in LAYOUTS if signal in layout.signals)
 
     def missing(self, what: str, *signals: str) -> str:
-        """Return a message about a missing signal: existing columns, the nearest layout, and the line to type."""
+        """Return a message about a missing signal: existing columns, most similar known layout, and line to type."""
         near = (self._nearest(layout, one) for layout in LAYOUTS for one in signals if one in layout.signals)
         share, program, missing, signal = max(near, key=lambda one: one[0])
         nearest = f" The layout of {program} lacks {', '.join(missing)}." if share else ""
@@ -223,7 +223,7 @@ class SignalColumns:
         return f"no {what} among the columns {named}.{nearest} Name the columns: {self.line(signal)}"
 
     def line(self, signal: str) -> str:
-        """Return the option or argument that names the columns of a signal, with the recognised columns filled in."""
+        """Return the option, or argument in Python, to name a signal's columns, filled in as far as recognised."""
         parts = {}
         for key in OWN_NAMES[signal].split():
             found = self._keys.get(key) or self._keys.get(_OTHER_NAMES.get(key, key))
@@ -249,7 +249,7 @@ class SignalColumns:
         return same[0], unit or [unit for _, unit in _keys_of(self.names[same[0]])][-1]
 
     def _complete(self, way: str) -> list[list[tuple[int, str]]]:
-        """Return the columns for each prefix with a complete list of names; equal names give several candidates."""
+        """Return each set of columns, as index and unit, whose names match all in `way`, for each common prefix."""
         if not (patterns := _written_out(way)):
             return []
         first = patterns[0].removeprefix("*")
@@ -269,7 +269,7 @@ class SignalColumns:
         return complete
 
     def _of_one_case(self, columns: Sequence[list[tuple[int, str]]]) -> list[list[tuple[int, str]]]:
-        """Return the columns without those in the other letter case: next to O and A, T is an angle and t is a time."""
+        """Prefer columns in the letter case of the others, so that next to O and A, T is an angle and t is a time."""
         upper = [self.names[one[0][0]].isupper() for one in columns if len(one) == 1] or [False]
         chosen = [[each for each in one if self.names[each[0]].isupper() == all(upper)] for one in columns]
         return [one if len(every) > 1 and one else list(every) for one, every in zip(chosen, columns, strict=True)]
@@ -296,7 +296,7 @@ class SignalColumns:
         return nearest
 
 
-# Names of the columns of each signal, as in `--columns`.
+# ftdrive's own names for the columns of each signal, as in the option `--columns`.
 OWN_NAMES: Final = {
     "time": "t",
     "wrench": "fx fy fz tx ty tz",
@@ -323,14 +323,14 @@ _OTHER_NAMES: Final = {"tx": "mx", "ty": "my", "tz": "mz", "t": "time"}
 
 
 def _normalized(name: str) -> str:
-    """Return a name in lower case, with `_` for every character that is not a letter or a digit."""
+    """Return a column name in lower case, with `_` for characters that are neither letters nor digits."""
     return re.sub(r"[\W_]+", "_", name.lower()).strip("_")
 
 
 def factor(unit: str, kind: str, column: str) -> float | None:
-    """Return the factor from a unit to SI; None without a unit. Raises `BadDataset` for a unit of another quantity.
+    """Return the factor from a unit to SI; None if `unit` is empty. Raises `BadDataset` unless it is a unit of `kind`.
 
-    The unit may have a numerical factor: `.82 N` corrects the scale of a sensor that was checked with a known mass.
+    The unit may begin with a number: `.82 N` corrects the scale of a sensor that was checked with a known mass.
     """
     if size := re.fullmatch(r"(\d*\.?\d+(?:e[+-]?\d+)?)\s+(\S.*)", unit.strip()):
         return float(size[1]) * (factor(size[2], kind, column) or 1.0)
@@ -350,7 +350,7 @@ def factor(unit: str, kind: str, column: str) -> float | None:
 
 
 def _keys_of(name: str) -> Iterator[tuple[str, str]]:
-    """Yield the possible keys of a name, each with the unit in the name, as for `fx [N]`, `t_ms`, `x (mm)`."""
+    """Split a column name such as `fx [N]`, `t_ms` or `x (mm)`: yield each possible normalized name with its unit."""
     match = _BEHIND.fullmatch(name) if len(name) <= _LONGEST_NAME else None
     if match and match["bracket"] is not None and re.search(r"[^\W\d]|°|^$", match["bracket"]):
         yield _normalized(match["name"]), match["bracket"].strip()
@@ -361,7 +361,7 @@ def _keys_of(name: str) -> Iterator[tuple[str, str]]:
 
 
 def _written_out(way: str) -> list[str]:
-    """Return the names of a list with `?` and `#` expanded."""
+    """Return the names in one list of a `Layout`, with `?` expanded to x, y, z and `#` to 0 to 5."""
     marks = {"?": "xyz", "#": "012345"}
     return [
         word.replace(mark, letter) if mark else word

@@ -23,15 +23,15 @@ from ftdrive.tables.columns import COUNTS, UNITS, Signal, SignalColumns, factor
 from ftdrive.tables.text import TextTable, seconds_of
 
 WrenchAxes = Literal["sensor", "flange", "tcp", "base"]
-# Axis sequences as in SciPy: upper case for rotations about tool axes, lower case about base axes.
+# Axis sequences of Euler angles as in SciPy: upper case for rotations about tool axes, lower case about base axes.
 _MAKERS: Final = {"rpy": "xyz", "abc": "ZYX", "wpr": "xyz", "oat": "ZYZ"}
-# Rotation axis of each angle column.
+# For each form of orientation, the axes to which its angle columns belong, in the order of the columns.
 _AXES: Final = {"rpy": "xyz", "abc": "zyx", "wpr": "xyz", "oat": "zyz", "vector": "xyz", "angles": "xyz"}
 _ORIENTATIONS: Final = (
     *("matrix", "quaternion", "quaternion_w_first", "transform", "tcp_pose", "vector", "rpy", "abc", "wpr", "oat"),
     *("angles", "joints", "gravity", "acceleration"),
 )
-# Forms of the orientation that a message may suggest, the most likely first.
+# Forms of the orientation that the message about a missing one compares with the table, the most likely first.
 _NEAREST: Final = ("quaternion", "matrix", "vector", "rpy", "abc", "tcp_pose")
 _KIND: Final = {
     "time": "time",
@@ -40,29 +40,29 @@ _KIND: Final = {
     **dict.fromkeys((*_AXES, "joints"), "angle"),
 }
 _LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
-# Largest deviation from unit length of a quaternion that is rounded to two decimals.
+# Largest accepted deviation of a quaternion's norm from 1, as for values that are rounded to two decimals.
 _ROUNDED_LENGTH = 0.01
-# Angles beyond two turns must be in degrees, and positions beyond the reach of any arm in mm.
+# If values without a unit exceed these, angles (two turns) are in degrees, and positions (any arm's reach) in mm.
 _MOST_RAD, _MOST_M = 4 * np.pi, 10.0
 _UNITS_OF_TIME: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-# Range of Unix times, from 1990 to 2100.
+# Times since 1970 in this range, s (1990 to 2100), are taken as Unix times.
 _EPOCH_S: Final = (6.3e8, 4.1e9)
-# Range of the time steps in a recording, 50 kHz to 5 Hz, and the smallest number of its rows.
+# A recording has time steps, s, in this range (50 kHz to 5 Hz), and at least this number of rows.
 _STEPS_S: Final = (2e-5, 0.2)
 _RECORDING_ROWS = 200
-# Range of the time from pose to pose, s; values outside it are in another unit.
+# Range of the time from pose to pose, s. Times without a unit that give other steps are not in s.
 _POSE_STEPS_S: Final = (0.5, 1e3)
-# Largest rotation between rows at rest, due to encoder noise and rounding.
+# Rows of a table whose orientations differ by less than this, as from encoder noise and rounding, are at rest.
 _AT_REST_RAD: Final = float(np.radians(0.2))
-# Rows at rest become poses if they are at least this share of the table; the other rows are moves between poses.
+# If at least this share of a table's rows is at rest, the arm stopped at poses, and the other rows are moves.
 _MOSTLY: Final = 0.9
-# For a vector closer than this to upside down, any horizontal axis will do to turn it upright.
+# A direction closer than this to straight up is turned over about a fixed horizontal axis, as any one will do.
 _UPSIDE_DOWN = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableOptions:
-    """Facts about a table that the table itself lacks.
+    """Facts that are needed to read a table of another program, and that the table itself does not contain.
 
     Raises
     ------
@@ -80,21 +80,21 @@ class TableOptions:
     columns: Mapping[str, str] = field(default_factory=dict)
     """Columns of the table by their names in ftdrive, with a unit if needed: ``{"fx": "Force X [kgf]"}``."""
     separator: Literal["", ",", ";", "\t", " "] = ""
-    """Separator of the text; recognised if empty."""
+    """Separator of the columns in a text table; if empty, it is recognised."""
     decimal: Literal["", ".", ","] = ""
-    """Decimal mark of the text; recognised if empty."""
+    """Decimal mark in a text table; if empty, it is recognised."""
     rate_Hz: float | None = None
-    """Sample rate of a table without times."""
+    """Sample rate of a table without times; None if the table has times, or poses at rest."""
     euler: str = ""
     """Order of the three angles: rpy, ABC, WPR, OAT, or three axes, such as ZYX (tool axes) or xyz (base axes)."""
     wrench_axes: WrenchAxes | None = None
-    """Axes and reference point of the wrench; None means the convention of the program, usually the sensor."""
+    """Axes and reference point of the wrench; None means those of the program that wrote the table, usually sensor."""
     R_flange_tcp: Array = field(default_factory=lambda: np.eye(3))
-    """(3, 3) orientation of the TCP, if the table has poses of the TCP."""
+    """(3, 3) orientation of the TCP relative to the flange, if the poses in the table are those of the TCP."""
     p_flange_tcp_m: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,) position of the TCP, if the table has poses of the TCP."""
+    """(3,) position of the TCP in flange axes, if the poses in the table are those of the TCP."""
     sign: Literal[1, -1] = 1
-    """Sign of the wrench: -1 for a sensor that reports the reaction."""
+    """Factor of the wrench: -1 for a sensor that reports the reaction, with the opposite sign."""
     forward: Callable[[Array], tuple[Array, Array]] | None = None
     """Forward kinematics: returns R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) for joint angles (n, 6), rad."""
 
@@ -116,16 +116,16 @@ _ANGLES_ONLY = "the order of the three angles is unknown: add --euler, such as Z
 
 
 class _ColumnSource(Protocol):
-    """A source of columns, which are read in blocks."""
+    """A table on disk or in memory, of which chosen columns are read in blocks of rows."""
 
     names: Sequence[str]
     units: Sequence[str]
     words: str
     comments: int
-    """Number of commented lines between the rows, which `blocks` has skipped."""
+    """Number of commented lines that `blocks` has skipped between the rows."""
 
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
-        """Yield the columns (n, k) of consecutive rows, with the share of the source read so far."""
+        """Yield blocks of consecutive rows with the k columns `use` (n, k), and the share of the table read so far."""
 
 
 class _FrameSource:
@@ -152,18 +152,18 @@ class _FrameSource:
 
 
 class SignalRows(NamedTuple):
-    """Consecutive rows of one signal."""
+    """Consecutive rows of one signal in a table."""
 
     t_s: Array
     """(n,) times."""
     values: Array
     """(n, k) values in SI units."""
     place: float
-    """Share of the source read so far."""
+    """Share of the table read so far, 0 to 1."""
 
 
 class Table:
-    """A table with recognised signals.
+    """A table of another program in which time, wrench and orientation are recognised.
 
     Parameters
     ----------
@@ -217,32 +217,32 @@ class Table:
 
     @property
     def words(self) -> str:
-        """Description of the recognised format in one line; empty if names and units are those of ftdrive."""
+        """One line about the recognised format of the table; empty if names and units are those of ftdrive."""
         programs = {signal.program for signal in self._found.values() if signal} - {"ftdrive", "own program"}
         named = [f"columns of {program}" for program in sorted(programs)]
-        if self.options.rate_Hz:  # nothing else reveals a wrong rate
+        if self.options.rate_Hz:  # shown because no check can detect a wrong rate
             named.append(f"{self.options.rate_Hz:g} Hz as given (the inertia depends on its square)")
         return "; ".join(filter(None, [self.source.words, *named, *self._guesses]))
 
     @property
     def has_nominal_kinematics(self) -> bool:
-        """Whether the orientations are computed from joint angles by nominal kinematics."""
+        """Whether the orientations are computed from the table's joint angles, by uncalibrated kinematics."""
         orientation = self._found["orientation"]
         return orientation is not None and orientation.form == "joints"
 
     @property
     def gravity_is_measured(self) -> bool:
-        """Whether the orientation is only a direction of gravity, without a rotation about the vertical."""
+        """Whether the table has directions of gravity instead of orientations, so rotations about it are unknown."""
         orientation = self._found["orientation"]
         return orientation is not None and orientation.form in ("gravity", "acceleration")
 
     def has(self, signal: Literal["wrench", "orientation"]) -> bool:
-        """Return whether the table has a signal."""
+        """Return whether the table has this signal."""
         return self._found[signal] is not None
 
     @cached_property
     def in_motion(self) -> bool:
-        """Whether the rows are a recording in motion: too fast for poses at rest, or from two streams."""
+        """Whether the table is a recording in motion: many rows at a high rate, or separate rows of two streams."""
         if self.gravity_is_measured or not (self.has("wrench") and self.has("orientation")):
             return False
         wrench, orientation = (np.isfinite(self._first[one]).all(axis=1) for one in ("wrench", "orientation"))
@@ -267,7 +267,7 @@ class Table:
         return (len(t_s) - 1) / max(float(t_s[-1] - t_s[0]), 1e-9)
 
     def wrenches(self) -> Iterator[SignalRows]:
-        """Yield wrenches (n, 6), N and N·m, in sensor or flange axes. Raises `BadDataset` after the last valid rows."""
+        """Yield wrenches (n, 6), N and N·m, in sensor or flange axes. Invalid rows raise `BadDataset` in turn."""
         signals = [self._require("wrench")]
         if self._axes == "base":
             signals.append(self._require("orientation"))
@@ -278,7 +278,7 @@ class Table:
             yield SignalRows(t_s, wrench, place)
 
     def poses(self) -> Iterator[SignalRows]:
-        """Yield R_base_flange, row-major, and p_base_flange_m if known: (n, 9 or 12). Errors as for `wrenches`."""
+        """Yield R_base_flange by rows, then p_base_flange_m if known: (n, 9 or 12). Errors as for `wrenches`."""
         signals = [self._require("orientation"), *([one] if (one := self._found["position"]) else [])]
         if self.gravity_is_measured:
             raise BadDataset(f"{self.name}: gravity does not determine the rotation about it: give the orientation too")
@@ -289,7 +289,7 @@ class Table:
             yield SignalRows(t_s, np.hstack([R.reshape(-1, 9), *([] if p is None else [p])]), place)
 
     def dataset(self, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
-        """Return the table as poses at rest: one per row, or one per dwell in a long table. Raises `BadDataset`."""
+        """Return the poses at rest: one per row, or one per dwell in a long table. Invalid rows raise `BadDataset`."""
         if orientation not in get_args(Orientation):
             raise ValueError(f"orientation is '{orientation}', expected one of {', '.join(get_args(Orientation))}")
         if self._found["sigma"] is None and self._columns.begins("sigma"):
@@ -330,7 +330,7 @@ class Table:
         return rows if sigma or len(rows) < _RECORDING_ROWS else self._of_dwells(rows)
 
     def _of_dwells(self, rows: CalibrationDataset) -> CalibrationDataset:
-        """Return one pose per dwell, or the rows unchanged if less than 90 % of them are at rest."""
+        """Average the rows of each dwell to one pose; return the rows unchanged if less than 90 % are at rest."""
         dwells = _dwells(rows.R_base_flange, rows.wrench)
         n_samples = np.array([len(range(*dwell.indices(len(rows)))) for dwell in dwells], np.int64)
         if n_samples.sum() < _MOSTLY * len(rows):
@@ -349,7 +349,7 @@ class Table:
         )
 
     def _form(self, form: str) -> dict[str, JSON]:
-        """Return the form of the orientations, which determines what mistakes in them are possible."""
+        """Return the notation of the orientations, such as Euler angles, for later checks for its typical mistakes."""
         if form in _AXES and (self.options.euler or form in _MAKERS):
             euler = self.options.euler or form
             return {"form": "euler", "euler": _MAKERS.get(euler.lower(), euler)}
@@ -369,7 +369,7 @@ class Table:
             return columns
         with self._named():
             words = self._columns.missing(signal, *(("wrench",) if signal == "wrench" else _NEAREST))
-            # A recording in motion often has one file per device.
+            # also suggest two files, because a recording in motion often has one file per device
             alone = signal == "orientation" and self.has("wrench") and self._found["time"] is not None
             raise BadDataset(f"{words}, or give poses of their own: --wrench, --orientation-file" if alone else words)
 
@@ -381,7 +381,7 @@ class Table:
             raise BadDataset(f"{self.name}: {error}") from error
 
     def _factors_of(self, signal: Signal, first: Array) -> Array:
-        """Return the factor from each column to SI units; a missing unit is inferred if the numbers leave no doubt."""
+        """Return a signal's factors to SI units; a missing unit is inferred if the first values leave no doubt."""
         names = [self.source.names[column] for column in signal.columns]
         kinds = {"tcp_pose": ["length"] * 3 + ["angle"] * 3}.get(signal.form, [_KIND.get(signal.form, "")] * len(names))
         if "wrench" in signal.form or signal.form == "sigma":
@@ -409,7 +409,7 @@ class Table:
         return np.array([guess if one is None else one for one in factors])
 
     def _in_order(self, signals: Sequence[Signal]) -> Iterator[tuple[Array, list[Array], float]]:
-        """Yield the non-empty blocks of `_rows`. Raises `BadDataset` if the time decreases."""
+        """Yield the non-empty blocks of `_rows`. Raises `BadDataset` if the times decrease from row to row."""
         last_s = -np.inf
         for t_s, values, place in self._rows(signals):
             if (back := np.diff(t_s, prepend=last_s) < 0).any():
@@ -420,9 +420,9 @@ class Table:
                 yield t_s, values, place
 
     def _rows(self, signals: Sequence[Signal]) -> Iterator[tuple[Array, list[Array], float]]:
-        """Yield times, values in SI units, and the share read so far, for the rows that have all these signals.
+        """Yield times, values in SI units, and the share of the table read, for the rows that have all these signals.
 
-        Times are NaN without time column and rate. Raises `BadDataset` for a row with an incomplete signal.
+        Without a time column or a rate, times are NaN. Raises `BadDataset` for a row with an incomplete signal.
         """
         with self._named():
             yield from self._complete_rows(signals)
@@ -464,7 +464,7 @@ class Table:
         return "base" if form == "base_wrench" else "sensor"
 
     def _in_flange(self, wrench: Array, pose: Sequence[Array]) -> Array:
-        """Return wrenches (n, 6) in flange axes about the flange origin; wrenches in sensor axes stay unchanged."""
+        """Convert wrenches (n, 6) to flange axes about the flange origin; those in sensor axes only get their sign."""
         force, torque = np.hsplit(self.options.sign * wrench, 2)
         if self._axes in ("sensor", "flange"):
             return np.hstack([force, torque])
@@ -477,13 +477,13 @@ class Table:
         return np.hstack([force, torque + np.cross(self.options.p_flange_tcp_m, force)])
 
     def _flange(self, values: Sequence[Array]) -> tuple[Array, Array | None]:
-        """Return R_base_flange (n, 3, 3), and p_base_flange_m (n, 3) or None, from the orientation and the position."""
+        """Return R_base_flange (n, 3, 3), and p_base_flange_m (n, 3) or None, from the columns of the pose."""
         orientation = self._found["orientation"]
         numbers, p = values[0], values[1] if len(values) > 1 else None
         form = "" if orientation is None else orientation.form
         if form == "tcp_pose":
             p, numbers, form = numbers[:, :3], numbers[:, 3:], "vector"
-        if form == "transform":  # column by column
+        if form == "transform":  # Franka writes the matrix column by column
             matrices = numbers.reshape(-1, 4, 4).swapaxes(1, 2)
             p, numbers, form = matrices[:, :3, 3], matrices[:, :3, :3].reshape(-1, 9), "matrix"
         if form == "quaternion_w_first":
@@ -505,7 +505,7 @@ class Table:
 
 
 def _dwells(R: Array, wrench: Array) -> list[slice]:
-    """Return the row range of each dwell: 20 or more rows in one orientation without a step in the wrench (n, 6)."""
+    """Return the rows of each dwell: at least 20 in one orientation R (n, 3, 3), with no step in the wrench (n, 6)."""
     dwells: list[slice] = []
     first = 0
     for end in (*(np.flatnonzero(angle_between(R[1:], R[:-1]) > _AT_REST_RAD) + 1), len(R)):
@@ -524,7 +524,7 @@ def _dwells(R: Array, wrench: Array) -> list[slice]:
 
 
 def _without_steps(wrench: Array, first: int, last: int) -> list[slice]:
-    """Split a dwell at steps in the wrench (n, 6), such as a tare; return parts of 20 rows or more."""
+    """Split the rows of a dwell at steps in the wrench (n, 6), such as a tare; return parts of 20 rows or more."""
     parts, waiting = list[slice](), [(first, last)]
     while waiting:
         first, last = waiting.pop()
@@ -537,7 +537,7 @@ def _without_steps(wrench: Array, first: int, last: int) -> list[slice]:
 
 
 def _largest_step(wrench: Array) -> int | None:
-    """Return the row at which the mean of the wrench (n, 6) changes most; None if the change is within the noise."""
+    """Return the row from which the mean of the wrench (n, 6) differs most; None if that difference may be noise."""
     n = len(wrench)
     before = np.arange(LEAST_SAMPLES, n - LEAST_SAMPLES + 1)
     path = np.cumsum(wrench - wrench.mean(axis=0), axis=0)[before - 1] / np.maximum(wrench.std(axis=0), 1e-300)
@@ -552,7 +552,7 @@ def _wrong_row(row: int, words: str) -> str:
 
 
 def _of_angles(angles: Array, euler: str, axes: str) -> Array:
-    """Return the rotations (n, 3, 3) by angles (n, 3) about `axes`, applied in the order of `euler`."""
+    """Return the rotations (n, 3, 3) for Euler angles (n, 3) in columns `axes`, applied in the order `euler`."""
     sequence = _MAKERS.get(euler.lower(), euler)
     if sequence.lower() != axes and sorted(sequence.lower()) == sorted(axes):
         angles = angles[:, [axes.index(axis) for axis in sequence.lower()]]
@@ -560,7 +560,7 @@ def _of_angles(angles: Array, euler: str, axes: str) -> Array:
 
 
 def _rotations(form: str, numbers: Array) -> Array:
-    """Return the rotations (n, 3, 3) that values (n, k) in this form describe. Raises `BadDataset`."""
+    """Return the rotations (n, 3, 3) that matrices, quaternions or vectors (n, k) give. Others raise `BadDataset`."""
     if form == "matrix":
         return proper_rotations(numbers.reshape(-1, 3, 3))
     length = np.linalg.norm(numbers, axis=1)
@@ -582,7 +582,7 @@ def _rotations(form: str, numbers: Array) -> Array:
 
 
 def _upright(gravity: Array) -> Array:
-    """Return the smallest rotations (n, 3, 3) that turn directions of gravity (n, 3) straight down."""
+    """Return the smallest rotations (n, 3, 3) that turn the directions of gravity (n, 3) to -z, straight down."""
     up = -gravity / np.linalg.norm(gravity, axis=1, keepdims=True)
     halfway = np.column_stack([np.cross(up, [0.0, 0.0, 1.0]), 1 + up[:, 2]])
     halfway[halfway[:, 3] < _UPSIDE_DOWN] = [1.0, 0.0, 0.0, 0.0]
@@ -590,7 +590,7 @@ def _upright(gravity: Array) -> Array:
 
 
 def _unit_of_time(t: Array, name: str) -> str:
-    """Return the unit of times (n,): s unless the numbers rule it out. Raises `BadDataset` if two other units fit."""
+    """Return the likely unit of times (n,): "s" if that is possible. Raises `BadDataset` if two other units fit."""
     t = t[np.isfinite(t)]
     steps = np.diff(t)
     steps = steps[steps > 0]
@@ -603,7 +603,7 @@ def _unit_of_time(t: Array, name: str) -> str:
     is_recording = len(t) >= _RECORDING_ROWS
     least, most = _STEPS_S if is_recording else _POSE_STEPS_S
     fitting = [unit for unit, size in _UNITS_OF_TIME.items() if least <= step * size <= most]
-    if "s" in fitting or not fitting or step < 1:  # slow samples in s, or fast samples in ms
+    if "s" in fitting or not fitting or step < 1:  # steps below 1 are not ms, us or ns
         return "s"
     if len(fitting) > 1 and is_recording:
         raise BadDataset(

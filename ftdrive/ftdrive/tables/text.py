@@ -1,4 +1,4 @@
-"""Text tables from other programs; the format is recognised from the first lines."""
+"""Text tables from other programs; separator, decimal mark and header are recognised from the first lines."""
 
 import csv
 import gzip
@@ -18,7 +18,7 @@ from ftcalib.errors import BadDataset
 from ftcalib.files import open_file
 from ftcalib.model import Array
 
-# Sizes in characters: a block, the first part that is examined, the longest header, the longest line.
+# Numbers of characters: in a block; examined first for the format; searched at most for the first row; in a line.
 _BLOCK, _FIRST, _HEAD, _LINE = 1 << 22, 1 << 16, 1 << 20, 1 << 18
 _SEPARATORS: Final = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
 _COMMENT = re.compile(r"\s*(#+|%+|//)\s*")
@@ -34,24 +34,24 @@ _UNIT_LENGTH = 20
 
 
 class _TextFormat(NamedTuple):
-    """Format of a text table."""
+    """Recognised format of a text table."""
 
     separator: str
     decimal: str
     names: Sequence[str]
     """Names of the columns as in the file; "1", "2", … if it has no header."""
     units: Sequence[str]
-    """Units from a second header row; empty strings without one."""
+    """Units from a row below the names of the columns; empty strings if there is no such row."""
     dates: Sequence[int]
     """Indices of columns with ISO 8601 dates, such as 2026-11-28 12:00:00.25."""
     first_line: int
-    """Line number of the first row of numbers, counted from 1."""
+    """Number, from 1, of the line with the first row of numbers."""
     words: str
     """Differences from a table with commas, decimal points and one row of names; empty if there are none."""
 
 
 class TextTable:
-    """A text table on disk; recognises separator and decimal mark if not given. Raises `BadDataset` or `OSError`."""
+    """A text table on disk. Separator and decimal mark are recognised if empty; if that fails, raises `BadDataset`."""
 
     def __init__(self, path: Path, separator: str = "", decimal: str = "") -> None:
         self.path, self.comments = path, 0
@@ -64,13 +64,13 @@ class TextTable:
 
     @contextmanager
     def _open(self) -> Iterator[tuple[Any, IO[bytes]]]:
-        r"""Yield the text with `\n` as line end, and the file on disk. Other Unicode line breaks belong to cells."""
+        r"""Yield the unpacked text, whose lines end with `\n`, and the file on disk. Cells keep other line breaks."""
         with open_file(self.path) as raw:
             packed = raw.read(2) == b"\x1f\x8b"
             raw.seek(0)
             file = io.BufferedReader(gzip.GzipFile(fileobj=raw)) if packed else raw
             try:
-                is_utf16 = file.peek(2)[:2] in (b"\xff\xfe", b"\xfe\xff")  # "Unicode text" of Excel
+                is_utf16 = file.peek(2)[:2] in (b"\xff\xfe", b"\xfe\xff")  # as Excel saves "Unicode text"
                 text = io.TextIOWrapper(file, "utf-16" if is_utf16 else "utf-8-sig", "replace", newline=None)
                 yield text, raw
             except (gzip.BadGzipFile, EOFError, zlib.error) as error:
@@ -79,7 +79,7 @@ class TextTable:
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
         """Yield the columns (n, k) of consecutive rows, with the share of the file read so far.
 
-        A blank cell is NaN, and a date is the time since 1970, s. Raises `BadDataset` after the last valid block.
+        A blank cell is NaN, and a date is the time since 1970, s. At a bad cell, raises `BadDataset`.
         """
         size = self.path.stat().st_size
         with self._open() as (file, raw):
@@ -107,7 +107,7 @@ class TextTable:
         numbers = self._numbers(rows, separator, use)
         if numbers is None:
             plain = "\n".join(["", *rows, ""])
-            # The first replacement is needed twice, because three consecutive blank cells overlap.
+            # Two adjacent separators are replaced twice, because those of consecutive blank cells overlap.
             for edge in (separator * 2, separator * 2, f"\n{separator}", f"{separator}\n"):
                 plain = plain.replace(edge, f"{edge[0]}nan{edge[1]}")
             numbers = self._numbers(plain.split("\n"), separator, use)
@@ -117,7 +117,7 @@ class TextTable:
         return numbers
 
     def _numbers(self, lines: Sequence[str], separator: str, use: Sequence[int]) -> Array | None:
-        """Return the columns of lines, read by numpy; None if numpy rejects a row or a cell, such as a blank one."""
+        """Read the columns `use` of lines with numpy; return None if it rejects a row or cell, such as a blank one."""
         if not (rows := list(filter(None, lines))):
             return None
         kinds = dict.fromkeys(range(len(self.names)), "U1") | dict.fromkeys(use, "f8")
@@ -126,19 +126,19 @@ class TextTable:
         try:
             table = np.loadtxt(rows, of_columns, comments=None, delimiter=separator, ndmin=1, quotechar='"')
             columns = [table[str(i)] if kinds[i] == "f8" else self._dates(table[str(i)], self.names[i]) for i in use]
-            # The cell of an unclosed quote would include the rows below.
+            # a quote that is not closed gives fewer rows, because its cell includes the rows below
             return np.column_stack(columns) if len(table) == len(rows) else None
         except (BadDataset, ValueError):
             return None
 
     def _dates(self, cells: NDArray[np.str_], name: str) -> Array:
-        """Return dates (n,) as times since 1970, s. Raises `BadDataset` or `ValueError`."""
+        """Return a column of dates (n,) as times since 1970, s. A cell that is no date raises `BadDataset`."""
         if all((match := _DATE.fullmatch(cell)) and not match[3] for cell in cells.tolist()):
             return seconds_of(cells.astype("datetime64[ns]"))
         return np.array([self._number(cell.strip(), name, 0) for cell in cells.tolist()])
 
     def _slowly_parsed(self, text: str, use: Sequence[int], first: int) -> Array:
-        """Return the columns of a text that numpy rejects, such as one with quoted separators. Raises `BadDataset`."""
+        """Read the columns of a text that numpy rejects, cell by cell. A cell that is no number raises `BadDataset`."""
         count, rows = len(self.names), []
         for line, one in enumerate(text.split("\n"), first):
             row = _split(one, self.format.separator)
@@ -171,13 +171,13 @@ class TextTable:
 
 
 def seconds_of(dates: NDArray[Any]) -> Array:
-    """Return dates (n,) as times since 1970, s."""
+    """Return dates (n,) as times since 1970, s; a missing date is NaN."""
     known = dates.astype("datetime64[ns]")
     return np.where(np.isnat(known), np.nan, known.astype(np.int64) * 1e-9)
 
 
 def _format_in(text: IO[str], separator: str, decimal: str) -> _TextFormat:
-    """Return the format of a text, recognised from as many of its first lines as needed. Raises `BadDataset`."""
+    """Recognise a text table's format from as many first lines as needed. Raises `BadDataset` if there is no table."""
     head = text.read(_FIRST)
     while True:
         more = text.read(len(head))
@@ -208,7 +208,7 @@ def _format_of(head: str, more: bool, separator: str, decimal: str) -> _TextForm
     _require_no_data(lines, above, numeric, separator, decimal)
     # A separator at the end of each line adds an empty column.
     ended = all(not row[-1] for row in rows[first:] if len(row) == count)
-    # Programs may write settings above the names, one per line.
+    # the names are the last line above the numbers, because programs may write settings above the names
     header = [(i, cells) for i in above if (cells := _header(lines[i], separator, count, ended))]
     units: Sequence[str] = ()
     if len(header) > 1 and header[-1][0] == above[-1] and all(map(_is_unit, header[-1][1])):
@@ -224,7 +224,7 @@ def _format_of(head: str, more: bool, separator: str, decimal: str) -> _TextForm
 
 
 def _decided(lines: Sequence[str], separator: str, decimal: str) -> tuple[str, str, int, int]:
-    """Return the separator and decimal mark that give the most numbers, and the columns and numbers per row."""
+    """Return the separator and decimal mark that give the most numbers, and how many columns and numbers a row has."""
     last = [line for line in lines if line.strip() and not _COMMENT.match(line)][-_DECIDE:]
     best = (",", ".", 0, 0)
     most = 0.0
@@ -235,7 +235,7 @@ def _decided(lines: Sequence[str], separator: str, decimal: str) -> tuple[str, s
         rows = [row for row in rows if len(row) == count]
         for point in decimal or ("." if between == "," else ".,"):
             numbers = [_count_numbers(row, point) for row in rows]
-            # Cells of other text reduce the score, because `1,5;2,5` has numbers between commas too.
+            # Cells that are no numbers reduce the score, because `1,5;2,5` split at commas has two numbers, too.
             score = sum(2 * n - sum(map(bool, row)) for n, row in zip(numbers, rows, strict=True) if n)
             if numbers and min(count, max(numbers)) > 1 and score > most:
                 best, most = (between, point, count, max(numbers)), score
@@ -247,7 +247,7 @@ def _split(line: str, separator: str) -> list[str]:
         return line.split()
     try:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
-    except csv.Error:  # a cell of more than 131,072 characters
+    except csv.Error:  # the csv module rejects cells above 131,072 characters
         return []
 
 
@@ -256,12 +256,12 @@ def _count_numbers(row: Sequence[str], decimal: str) -> int:
 
 
 def _is_data(line: str, row: Sequence[str], decimal: str, numeric: int) -> bool:
-    # In a table of two topics, half of the cells are blank.
+    # require few numbers, because in a table of two ROS topics half of the cells are blank
     return not _COMMENT.match(line) and _count_numbers(row, decimal) > max(1, numeric // 4)
 
 
 def _require_no_data(lines: Sequence[str], above: Sequence[int], numeric: int, separator: str, decimal: str) -> None:
-    """Raise `BadDataset` if a line above the first row is a row of numbers in another format."""
+    """Raise `BadDataset` if a line above the first row has numbers with another separator or decimal mark."""
     for i in above:
         for between, point in ((one, other) for one in _SEPARATORS for other in ".,"):
             cells = [cell for cell in _split(lines[i], between) if cell]
@@ -278,7 +278,7 @@ def _is_unit(cell: str) -> bool:
 
 
 def _header(line: str, separator: str, count: int, ended: bool) -> list[str]:
-    """Return the names in a header line, which may be commented and may have other separators."""
+    """Return the `count` names in a header line, possibly a comment or with another separator; [] if it has none."""
     line = line[found.end() :] if (found := _COMMENT.match(line)) else line
     for other in (separator, *_SEPARATORS):
         cells = _split(line, other)
