@@ -1,4 +1,4 @@
-"""All facts in a report as one JSON object, from which every format is written."""
+"""All facts about a calibration for its report, as one JSON object from which every format is written."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -45,7 +45,7 @@ _LABELS = {
 
 
 def label_of(parameter: str) -> str:
-    """Return the label of an error coordinate or of its vector, such as "force bias x" for "force_bias_N.x"."""
+    """Return the label of a parameter, such as "force bias x" for "force_bias_N.x", or of a whole vector."""
     name, _, axis = parameter.partition(".")
     return f"{_LABELS[name]} {axis}".strip()
 
@@ -53,9 +53,9 @@ def label_of(parameter: str) -> str:
 def comparison_facts(result: CalibrationResult, before: CalibrationResult) -> dict[str, Any]:
     """Return the comparison of a result with an earlier one, usually from other data.
 
-    `sensors` are the sources of the sensor errors, before and now. `parameters` have for each error coordinate its
-    `name`, `change` (rad, N, m, N·m) and `sigmas`, null if exactly known in both. `groups` are tests. `same_data` means
-    that both use one dataset, so the tests do not apply.
+    `sensors` are texts about the sensor errors, before and now. `parameters` have for each error coordinate its `name`,
+    `change` (rad, N, m, N·m), and `sigmas`, null if exactly known in both. `groups` are tests for equality. `same_data`
+    means that both use one dataset, so the tests do not apply.
     """
     found = calibration_difference(before, result)
     data = [one.provenance.get("dataset_sha256") for one in (result, before)]
@@ -77,15 +77,15 @@ def comparison_facts(result: CalibrationResult, before: CalibrationResult) -> di
     }
 
 
-# Forces at the tip for which the sigma is drawn, N.
+# Forces at the tool tip, N, for which the report draws the standard deviation.
 FORCES_N = np.arange(0.0, 101.0, 5.0)
 
 
 def contact_error(result: CalibrationResult) -> dict[str, Any]:
-    """Return the sigma of a force at the tip: the rms norm of its error over all directions.
+    """Return how uncertain a measured force at the tool tip is: `sigma_N`, the rms error over all directions.
 
-    `tip_m` (3,) is relative to the sensor origin, sensor axes. Without known loads, the sigma `without_loads_N` (n,)
-    and the `tool` corrected for sensor errors are null.
+    `tip_m` (3,) is relative to the sensor origin, sensor axes. If known loads were measured, `without_loads_N` (n,) is
+    the sigma without them, and `tool` is corrected for the sensor errors that they show; otherwise both are null.
     """
     without, tool = None, None
     if result.known_contact is not None:
@@ -135,17 +135,17 @@ NEXT_STEP = {
     ),
 }
 NOTABLE_CORRELATION = 0.7
-# Parts of a plan that the report omits.
+# Fields of a plan that the report leaves out, because they are long.
 _LONG = ("steps", "made_for", "description")
 
 
 def facts_of(subject: Subject, trust: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return the facts; sections without data are null.
+    """Return the facts of a report as JSON; a fact without data is null.
 
-    The names contain the units: rad, m, N, N·m, s. `result` is the content of the calibration file; `trust` is its age
-    and last verification, from `ftdrive.report.subject`.
+    The names contain the units: rad, m, N, N·m, s. The fact `result` is the content of the calibration file, and
+    `trust` its age and last verification, from `ftdrive.report.subject.trust_facts`.
     """
-    # All formats are written from these facts, so they agree.
+    # The page and the JSON of a report are written from these facts, so that they agree.
     result, dataset = subject.result, subject.dataset
     sweep = _planned_sweep(subject.run)
     R_base_flange = dataset.R_base_flange if dataset is not None else None if sweep is None else sweep.R_base_flange
@@ -263,7 +263,7 @@ def _drift_facts(subject: Subject) -> dict[str, Any]:
 
 
 def _noise_facts(subject: Subject) -> dict[str, Any] | None:
-    """Return the standard error of the mean at each pose, for one axis; None if it was not measured."""
+    """Return the standard errors of the mean wrench at each pose, averaged over the axes; None if not measured."""
     if subject.dataset is None or subject.dataset.wrench_cov is None:
         return None
     variance = np.einsum("nii->ni", subject.dataset.wrench_cov)

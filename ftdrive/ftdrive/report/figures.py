@@ -1,6 +1,6 @@
-"""The figures of a report as SVG in the colours of the page, so that one file serves light and dark mode.
+"""The figures of a report as SVG in the colours of the page, which differ in light and dark mode.
 
-Matplotlib writes fixed colours. Each colour used here is replaced by a CSS variable afterwards.
+Matplotlib writes fixed colours, so each colour used here stands for a CSS variable that replaces it afterwards.
 """
 
 import math
@@ -25,7 +25,7 @@ from ftdrivers.sweep import WRISTS, Sweep
 
 INK, PAPER, GRID, BAD = "#010101", "#020202", "#030303", "#040404"
 SERIES = ("#050505", "#060606", "#070707")
-# CSS variable of the page for each colour.
+# CSS variable of the page that replaces each colour.
 VARIABLES = {
     INK: "currentColor",
     PAPER: "var(--paper)",
@@ -33,13 +33,13 @@ VARIABLES = {
     BAD: "var(--bad)",
     **{colour: f"var(--series-{k})" for k, colour in enumerate(SERIES)},
 }
-# Text stays readable on a phone, and two figures fit side by side on a desktop screen.
+# Width of a figure, inches: text stays readable on a phone, and two figures fit side by side on a desktop screen.
 WIDTH_IN = 5.0
-# Durations above this, s, are shown in minutes.
+# Time axes of runs longer than this, s, are in minutes.
 LONG_S = 200
-# Largest number of dots in a figure, because each dot enlarges the file; if there are more, every n-th is drawn.
+# Largest number of dots in a figure, because each one enlarges the file. Of more dots, only every n-th is drawn.
 MOST_DOTS = 400
-# Correlations below this are not drawn.
+# Correlations with an absolute value below this are not drawn.
 INVISIBLE = 0.02
 _STYLE: Mapping[Any, Any] = {
     "svg.fonttype": "none",
@@ -69,7 +69,7 @@ def draw_figure(name: str, facts: Facts) -> str:
     height, (left, right, bottom, top), fill = _FIGURES[name]
     height_in = height(facts) if callable(height) else height
     with mpl.rc_context(dict(_STYLE)):
-        # Fixed margins, because an automatic layout would take as long as the drawing itself.
+        # The margins are fixed, because an automatic layout would take as long as the drawing itself.
         figure = Figure(figsize=(WIDTH_IN, height_in))
         figure.subplots_adjust(left / WIDTH_IN, bottom / height_in, 1 - right / WIDTH_IN, 1 - top / height_in)
         fill(figure, facts)
@@ -79,7 +79,7 @@ def draw_figure(name: str, facts: Facts) -> str:
 
 
 def _inline_svg(svg: str, name: str) -> str:
-    """Return a matplotlib SVG file as an element of a page: unique ids, variable colours, no prologue or size."""
+    """Convert the SVG file of matplotlib to an element for a page: unique ids, CSS colours, no prologue, no size."""
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
     svg = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" aria-hidden="true">', svg, count=1)
     svg = re.sub(r'\bid="', f'id="{name}-', svg)
@@ -119,7 +119,7 @@ def _draw_coverage(figure: Any, facts: Facts) -> None:
         circle = np.cos(radius) * towards + np.sin(radius) * np.outer(np.cos(turn), across[0])
         circle += np.sin(radius) * np.outer(np.sin(turn), across[1])
         x, y = _on_map(circle)
-        jumps = np.flatnonzero(np.hypot(np.diff(x), np.diff(y)) > 0.7) + 1  # at the edge of the map
+        jumps = np.flatnonzero(np.hypot(np.diff(x), np.diff(y)) > 0.7) + 1  # where the circle crosses the map's edge
         axes.plot(np.insert(x, jumps, np.nan), np.insert(y, jumps, np.nan), "--", color=SERIES[1], linewidth=1.5)
 
 
@@ -137,7 +137,7 @@ def _globe(axes: Any) -> Iterator[None]:
     box = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "edgecolor": "none"}
     for name, elevation, azimuth in (("+x", 0, 0), ("+y", 0, 90), ("-y", 0, -90), ("-x", 0, 180), ("-x", 0, -180)):
         x, y = _hammer_map(*np.radians([elevation, azimuth]))
-        axes.text(x, y - 0.2, name, ha="center", va="center", fontsize=8, bbox=box)  # below a pose that is drawn here
+        axes.text(x, y - 0.2, name, ha="center", va="center", fontsize=8, bbox=box)  # below a dot on this axis
     axes.text(0, np.sqrt(2) + 0.08, "+z", ha="center", va="bottom", fontsize=8)
     axes.text(0, -np.sqrt(2) - 0.08, "-z", ha="center", va="top", fontsize=8)
 
@@ -177,7 +177,7 @@ def _draw_correlation(figure: Any, facts: Facts) -> None:
     axes.spines[:].set_visible(False)
     seen = np.argwhere(matrix > INVISIBLE)
     corners = seen[:, None, ::-1] + [[0, 0], [1, 0], [1, 1], [0, 1]]
-    colours = [to_rgba(SERIES[0], matrix[i, j]) for i, j in seen]  # the opacity shows the strength
+    colours = [to_rgba(SERIES[0], matrix[i, j]) for i, j in seen]  # opacity is strength
     axes.add_collection(PolyCollection(list(corners), facecolors=colours, linewidth=0), autolim=False)
     for edge in range(0, n + 1, 3):
         axes.plot([0, n], [edge, edge], color=GRID, linewidth=0.8)
@@ -293,7 +293,7 @@ def _draw_comparison(figure: Any, facts: Facts) -> None:
 
 
 _Margins = tuple[float, float, float, float]
-# For each figure: height and margins (left, right, bottom, top) in inches, and the function that draws it.
+# For each figure of the report: height and margins (left, right, bottom, top), inches, and the drawing function.
 _FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callable[[Any, Facts], None]]] = {
     "force_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "force_N", "mN")),
     "torque_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "torque_Nm", "mN·m")),

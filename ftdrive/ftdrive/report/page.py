@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def render_page(facts: Facts) -> str:
-    """Return the HTML page of the facts from `ftdrive.report.facts.facts_of`. Raises `ConfigError` without jinja2."""
+    """Return a report as an HTML page, from the facts of `facts_of`. Raises `ConfigError` if jinja2 is missing."""
     environment = templates("ftdrive.report", "a report in HTML", "report", "--format json")
     from markupsafe import Markup
 
@@ -28,12 +28,12 @@ def render_page(facts: Facts) -> str:
 
 
 def templates(package: str, what: str, extra: str, instead: str) -> "Environment":
-    """Return the templates of a package, in which every value is escaped.
+    """Return the HTML templates in a Python package, which escape every value that they show.
 
     Raises
     ------
     ConfigError
-        jinja2 is not installed: `what` needs it, `extra` contains it, and the option `instead` works without it.
+        jinja2 is not installed. The message says that `what` needs it, and to install `extra` or give `instead`.
     """
     try:
         from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -49,7 +49,7 @@ def templates(package: str, what: str, extra: str, instead: str) -> "Environment
 
 
 def with_code(text: str) -> "Markup":
-    """Escape a text, and format text between backticks as code."""
+    """Escape a text for HTML, and turn text between backticks into code elements."""
     from markupsafe import Markup, escape
 
     return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))

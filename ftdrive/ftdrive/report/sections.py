@@ -17,10 +17,10 @@ from ftdrive.words.result import SIGMA_OF_THE_TOOL, estimate_rows
 
 Facts = Mapping[str, Any]
 
-# Root mean square over the six channels, in sigmas, that one good pose in 1000 exceeds.
+# A pose is suspicious if its rms residual over the six channels, in sigmas, is larger. So is 1 good pose in 1000.
 SUSPICIOUS_SIGMAS = 1.9
 _AXES = "xyz"
-# A channel with a sigma below this, N or N·m, has no drift.
+# A channel whose drift has a sigma below this, N or N·m, is regarded as free of drift.
 _ROUNDING = 1e-9
 
 
@@ -32,17 +32,17 @@ class ReportTable:
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
     folded: bool = False
-    """Whether the table is long, so that a page shows it on request."""
+    """Whether a page hides the table until the reader opens it, because it is long."""
 
     @property
     def narrow(self) -> bool:
-        """Whether the table fits next to a figure."""
+        """Whether the table has few enough columns to fit next to a figure."""
         return 2 < len(self.columns) <= 4
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """The name of a figure, its text alternative, and its caption, which explains what a good result looks like."""
+    """A figure of a report: its name, text alternative, and caption, which explains what a good result looks like."""
 
     name: str
     alt: str
@@ -51,7 +51,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A section with a heading; `name` is its anchor."""
+    """A section of a report; `name` is its anchor in the page."""
 
     name: str
     title: str
@@ -61,7 +61,7 @@ class Section:
 
 
 def rounded(value: float | None, digits: int = 3) -> str:
-    """Return a number with `digits` significant digits, without an exponent; "-" for None."""
+    """Format a number with `digits` significant digits and without an exponent; None becomes "-"."""
     if value is None:
         return "-"
     if value == 0 or not math.isfinite(value):
@@ -76,7 +76,7 @@ def capitalized(words: str) -> str:
 
 
 def shown_poses(poses: Sequence[Any], most: int = 200) -> list[Any]:
-    """Return the poses to list and draw, in order: all of them, or the worst ones and evenly spaced others."""
+    """Return the poses to list and draw: all, or if there are more than `most`, the worst and evenly spaced others."""
     if len(poses) <= most:
         return list(poses)
     size = np.array([pose["sigmas"] or pose["force_N"] for pose in poses])
@@ -86,7 +86,7 @@ def shown_poses(poses: Sequence[Any], most: int = 200) -> list[Any]:
 
 
 def estimates_section(facts: Facts) -> Section:
-    """Return the section with the estimates, their correlations, and gain and cross-talk if estimated."""
+    """Return the section with the estimates, their correlations, and, if estimated, gain and cross-talk."""
     result, strong = facts["result"], facts["correlation"]["strong"]
     taken = "poses" if facts["motion"] is None else "parts of the motion"
     pairs = "; ".join(f"{label_of(one)} and {label_of(other)} {value:+.2f}" for one, other, value in strong[:5])
@@ -124,7 +124,7 @@ def _pair(value: float, sigma: float, sign: str = "") -> tuple[str, str]:
 
 
 def error(facts: Facts) -> Section:
-    """Return the section with the predicted error over all orientations, and its worst direction."""
+    """Return the section with the predicted compensation error over all orientations, and the worst orientation."""
     force, torque = facts["error_map"]["force_N"], facts["error_map"]["torque_Nm"]
     text = [
         f"Compensation error of a free tool at the next use: {facts['error']['words']}.",
@@ -160,7 +160,7 @@ def error(facts: Facts) -> Section:
 
 
 def contact(facts: Facts) -> Section:
-    """Return the section with the sigma of a contact, which includes the errors of the sensor."""
+    """Return the section with the standard deviation of a contact force, which includes the sensor's errors."""
     found = facts["contact"]
     text = [
         "The compensation error above applies to a free tool. Under contact, the errors of the sensor are added; they "
@@ -190,7 +190,7 @@ def contact(facts: Facts) -> Section:
 
 
 def cross_validation(facts: Facts) -> Section:
-    """Return the section with the leave-one-out error of each method."""
+    """Return the section with the leave-one-out error of each calibration method."""
     found = facts["cross_validation"]
     text = []
     if found["force_N"] is not None:
@@ -230,7 +230,7 @@ def cross_validation(facts: Facts) -> Section:
 
 
 def residuals(facts: Facts) -> Section:
-    """Return the section with the residuals per pose and over time; for a motion, those of its parts."""
+    """Return the section with the residuals per pose and over time; for a calibration in motion, per part of it."""
     result, poses, in_motion = facts["result"], facts["poses"], facts["motion"] is not None
     text = [
         f"Residuals: {facts['residuals']}.",
@@ -282,7 +282,7 @@ def residuals(facts: Facts) -> Section:
 
 
 def drift(facts: Facts) -> Section:
-    """Return the section with the drift that was fitted, and the change of the repeated first pose."""
+    """Return the section with the fitted drift of the bias, and the change of the first pose when repeated."""
     seen = facts["drift"]
     found, again = seen["in_fit"], seen["first_pose_again"]
     text = []
@@ -311,7 +311,7 @@ def drift(facts: Facts) -> Section:
 
 
 def noise(facts: Facts) -> Section:
-    """Return the section with the noise of the mean at each pose."""
+    """Return the section with the standard error of the mean wrench at each pose."""
     measured = facts["noise"]
     if measured is None:
         why = "The source contains no noise of its poses: add columns sigma_fx to sigma_tz, or calibrate with ftdrive."
@@ -355,9 +355,9 @@ def coverage(facts: Facts) -> Section:
     return Section("coverage", title, text, [figure])
 
 
-# One difference in 370 exceeds this number of sigmas by chance.
+# Differences above this number of sigmas are marked; by chance, 1 in 370 is larger.
 LIMIT_SIGMAS = 3
-# Sigmas that a plan predicts: name with unit, factor to this unit, and key in the plan and the result.
+# Quantities whose sigmas a plan predicts: name with unit, factor to this unit, and key in the plan and the result.
 _PREDICTED = (
     ("mass, g", 1e3, "mass_kg"),
     ("centre of mass, mm", 1e3, "p_sensor_com_m"),
@@ -366,7 +366,7 @@ _PREDICTED = (
     ("force compensation, N", 1.0, "force_rms_N"),
     ("torque compensation, N·m", 1.0, "torque_rms_Nm"),
 )
-# A sigma is reported if it exceeds the predicted one by more than this factor.
+# The report names sigmas that exceed those predicted by the plan by more than this factor.
 _AS_PREDICTED = 1.2
 _AS_GOOD = "No sigma is more than 20 % larger than predicted."
 _WHY_LARGER = "Noise or errors of this sensor are larger than the plan assumed."
@@ -417,7 +417,7 @@ def _largest_size(values: Any) -> float:
 
 
 def comparison(facts: Facts) -> Section:
-    """Return the section with the differences from the previous result."""
+    """Return the section with the differences from the parent, an earlier result."""
     found, title = facts["comparison"], "Comparison with the previous result"
     if found is None:
         why = facts["compared_with"] or "There is no result to compare with: give one with --parent."
@@ -483,7 +483,7 @@ def _last_verification(trust: Facts) -> Iterator[str]:
 
 
 def motion(facts: Facts) -> Section:
-    """Return the section with the parameters that only a motion determines, and the planned sweep."""
+    """Return the section with what only a calibration in motion determines, such as inertia, and the planned sweep."""
     found = facts["motion"]
     sigma = found["sigma"]
     moments, of_moments = (np.array(values) for values in (found["inertia_kg_m2"], sigma["inertia_kg_m2"]))
@@ -519,7 +519,7 @@ def motion(facts: Facts) -> Section:
 
 
 def sections_of(facts: Mapping[str, Any]) -> list[Section]:
-    """Return the sections in reading order; a section without data gives the reason.
+    """Return the sections of a report in reading order; a section without data says why.
 
     A calibration in motion has no poses, and therefore no sections about single poses.
     """

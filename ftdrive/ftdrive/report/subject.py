@@ -1,4 +1,4 @@
-"""Subject of a report: a result, and the data in its source."""
+"""Subject of a report: a result, and the data from which it was solved."""
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +18,7 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.source import RecordedData, SolveOptions, read_source, solve_in_motion
 from ftdrive.runs.verification import age_and_check, newest, verification_near
 
-# Message for a store that cannot be read.
+# Message of a report if the store of verifications cannot be read.
 MAY_BE_MISSING = "a later verification may be missing, because {}"
 
 
@@ -29,12 +29,12 @@ def trust_facts(
 
     `source` is the file or run folder of the result. `store_url` reads `[store] url`; None means the user's store.
     """
-    # Importing SQLAlchemy takes a quarter of a second, for which a help text must not wait.
+    # imported here, because a help text must not wait 0.25 s for the import of SQLAlchemy
     from ftdrive.store.store import Store
 
     last, error = verification_near(source, result.id), ""
     try:
-        # Take the later of the verifications in the folder and in the store: the store may be new, the folder moved.
+        # Search both, because a new store may lack a verification, and so may the folder of a moved result.
         last = newest(filter(None, (last, Store(store_url()).last_verification(result.id))))
     except (BadStore, ConfigError) as unreadable:
         error = str(unreadable)
@@ -46,24 +46,24 @@ def trust_facts(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """A result with its data; data missing in the source are None or empty."""
+    """A result with the data from which it was solved; what the source does not contain is None or empty."""
 
     source: Path
     result: CalibrationResult
     reproduce: str
-    """Command that reproduces the result; empty if there are no data."""
+    """Command that reproduces the result; empty if the source has no data."""
     dataset: CalibrationDataset | None = None
     run: Run | None = None
     records: Sequence[PoseRecord] = ()
     solved_with: Mapping[str, Any] = field(default_factory=dict)
-    """Arguments of `ftcalib.compare` in addition to the dataset."""
+    """Arguments of `ftcalib.compare` besides the dataset, to compare the methods under the same assumptions."""
     parent: CalibrationResult | None = None
     parent_name: str = ""
-    """Name of the result to compare with, or the reason why there is none."""
+    """Name of the result `parent` to compare with, or why it was not found."""
 
 
 def read_subject(source: Path, options: SolveOptions, parent: Path | None = None) -> Subject:
-    """Read a calibration file, a run folder, a dataset.json or a CSV file; solve data that are not solved yet.
+    """Read a calibration file, a run folder, a dataset.json or a table; solve data that have no result yet.
 
     The saved result of a run folder is used if it belongs to the current poses and no option requires a new one. A
     calibration file in a run folder is reported with the data of that run. The result is compared with `parent`, by
@@ -80,7 +80,7 @@ def read_subject(source: Path, options: SolveOptions, parent: Path | None = None
 
 
 def _is_calibration(source: Path) -> bool:
-    """Whether a file has the format of a calibration; False if it is not JSON (reported when read as data)."""
+    """Whether a file is a calibration; False if it is no valid JSON, because reading it as data reports that."""
     if source.is_dir() or source.suffix != ".json":
         return False
     try:

@@ -305,7 +305,7 @@ def _extract(source: Path, folder: Path) -> Path:
     except FileNotFoundError as error:
         raise BadBundle(f"{source} is not a bundle, because it has no bundle.json: {_COPY_AGAIN}") from error
     except (*ZIP_DAMAGE, OSError) as error:
-        if isinstance(error, OSError) and error.errno not in (None, EINVAL):  # such as a full disk
+        if isinstance(error, OSError) and error.errno not in (None, EINVAL):  # such as for a full disk
             raise
         raise BadBundle(f"{source} is not a zip file or is damaged ({error}): {_COPY_AGAIN}") from error
 
@@ -320,7 +320,7 @@ def _run_in(folder: Path) -> Path:
 
 
 def _require_harmless(members: Sequence[zipfile.ZipInfo]) -> None:
-    """Raise `BadBundle` for dangerous names or sizes; `zipfile` reads no more than the stated size of a file."""
+    """Raise `BadBundle` for dangerous names or stated sizes of files; `zipfile` never unpacks more than is stated."""
     if len(members) > MOST_FILES or sum(member.file_size for member in members) > MOST_BYTES:
         limits = f"{MOST_BYTES / 1e9:g} GB or {MOST_FILES} files"
         raise BadBundle(f"its unpacked content exceeds {limits}: do not use this file, or unpack it by hand")

@@ -71,7 +71,7 @@ def at(document: Any, *keys: str) -> Any:
 
 
 def text_at(document: Any, *keys: str) -> str | None:
-    """Return the string at a path of keys without NUL characters and lone surrogates, which databases reject."""
+    """Return the string at a path of keys, without characters that databases reject; None if empty or no string."""
     value = at(document, *keys)
     return value.encode(errors="replace").decode().replace("\0", "\ufffd") if isinstance(value, str) and value else None
 

@@ -41,7 +41,7 @@ class Load(KnownLoad):
 
     @property
     def most_swing_N(self) -> float | None:
-        """Force amplitude of a 5-degree swing, above which a pose is repeated; None if the load is gripped."""
+        """Force amplitude, N, of a 5-degree swing of the load, above which a pose is repeated; None if gripped."""
         return None if self.gripped else self.mass_kg * STANDARD_GRAVITY_M_S2 * sin(_MOST_SWING_RAD)
 
     def sampling(self, usual: Sampling) -> Sampling:

@@ -61,7 +61,7 @@ class MotionRecording:
 
     @property
     def count(self) -> Array:
-        """What the sensor gives to order its samples: times on its clock, s, or numbers; NaN for a polled sensor."""
+        """Times on the sensor's clock, s, or, without a clock, its sample numbers; NaN if polled, without either."""
         if np.isfinite(self.samples.t_device_s).all():
             return self.samples.t_device_s
         even = math.isfinite(self.nominal_rate_Hz)

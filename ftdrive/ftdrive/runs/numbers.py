@@ -65,7 +65,7 @@ def line_with_crc(content: Mapping[str, Any]) -> str:
 
 
 def append_lines(file: FileIO, begin: int, objects: Sequence[Mapping[str, Any]]) -> None:
-    """Append all lines to an unbuffered file that ends at `begin`, or none if that fails. Raises `OSError`."""
+    """Append objects as lines to an unbuffered file of size `begin`. If an `OSError` is raised, none is in the file."""
     content = "".join(line_with_crc(item) + "\n" for item in objects).encode()
     try:
         while content:

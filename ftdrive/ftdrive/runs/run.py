@@ -98,7 +98,7 @@ class Run(Displayed):
         self._held = ExitStack()
 
     def __enter__(self) -> Self:
-        """Lock the folder until the block or the process ends; raises `ConfigError` if another process uses it."""
+        """Lock the folder until the block or the process ends. Raises `ConfigError` if another process locks it."""
         try:
             import fcntl
         except ImportError:  # on Windows, where no session runs
@@ -275,7 +275,7 @@ class Run(Displayed):
         return _Whole(path, header)
 
     def header_to_resume(self) -> Mapping[str, Any]:
-        """Return the contents of run.json; also raises `BadDataset` if the plan of the run is missing."""
+        """Return the contents of run.json. Raises `BadDataset` if it is damaged, or if a needed plan is missing."""
         header = self.header()
         for section, key in (("robot", "host"), ("sensor", "url")):
             header["config"][section][key]  # raise `BadDataset` if it is missing

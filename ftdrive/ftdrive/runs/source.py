@@ -55,7 +55,7 @@ class RecordedRun:
         self._collected = False
 
     def state(self) -> ArmReading:
-        """Return the state before or after the samples."""
+        """Return the recorded state of the arm before the samples, or after them once `collect` was called."""
         record = self._records[self._stop]
         return record.after if self._collected else record.before
 
@@ -300,7 +300,7 @@ class RecordedData:
         as_published: bool = False,
         earlier: CalibrationResult | None = None,
     ) -> CalibrationResult:
-        """Return the calibration; with an earlier result, given or recorded in the run, solve only for a new tool."""
+        """Return the calibration; with an earlier result, given here or in the run, solve only for a new tool."""
         earlier = earlier or self.earlier
         if earlier is not None:
             require_same_cell(earlier, self.provenance)

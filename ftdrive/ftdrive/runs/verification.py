@@ -286,7 +286,7 @@ class Verified:
 
 
 def verify_run(run: "Run", calibration: "CalibrationResult", path: Path, limits: Limits) -> Verified:
-    """Compare the poses of a run with a calibration; write dataset.json and verification.json, return the result."""
+    """Compare the poses of a run with a calibration; write dataset.json and verification.json, return the outcome."""
     from ftcalib.after.verification import verify_calibration
     from ftcalib.data.dataset import pooled_covariance
     from ftcalib.routine import dataset_from, drift_check, is_return

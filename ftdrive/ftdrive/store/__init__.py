@@ -21,17 +21,17 @@ def store_url() -> str | None:
 
 
 def open_store(url: str | None = None) -> "Store":
-    """Return the store at an address, by default the one in the environment and the files."""
+    """Return the store at an address, by default the address from `store_url`."""
     from ftdrive.store.store import Store
 
     return Store(url or store_url())
 
 
 def index_run(folder: Path, say: Callable[[str], object], cell: CellConfig | None = None) -> None:
-    """Add a run, and the other new runs in its parent folder, to the store; report an error by one call to `say`.
+    """Add a run, and other new runs in its parent folder, to the store of `cell`, or without a cell of `store_url`.
 
-    The run folder is complete without the store, and a later call adds it. Without `cell`, the store is the one in the
-    environment and the files.
+    An error is only reported, by one call to `say`, because the run folder is complete without the store, and a later
+    call adds it.
     """
     from ftdrive.store.store import Store
 

@@ -41,11 +41,11 @@ from ftdrive.runs.weighings import REFUSALS, WeighingDay
 from ftdrive.store.records import Record, StoredCell, StoredResult
 from ftdrivers.installation import missing_extra
 
-# Version of the index; the database stores it.
+# Version of the tables, which the database stores too.
 SCHEMA: Final = 4
 
 AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
-# Fields of a verification with one column per component: 18 columns are read three times as fast as one JSON column.
+# Fields of a verification with 6 components each. They get 18 columns, which are read 3 times as fast as JSON.
 WRENCHES = ("bias_change", "bias_change_sigma", "calibration_sigma")
 
 metadata: Final = MetaData()
@@ -56,7 +56,7 @@ _TYPES: Final = {str: String, int: Integer, float: Float, bool: Boolean}
 def _define_table(
     name: str, record: type, *more: Column[Any], key: str = "id", index: Collection[str] = (), without: Collection[str]
 ) -> Table:
-    """Return a table with the fields of a record (as JSON if no other column type fits) and `more` columns."""
+    """Define a database table for records: a column per field (JSON if no other type fits), and `more` columns."""
     columns = list[Column[Any]]()
     for field, hint in get_type_hints(record).items():
         is_optional = isinstance(hint, UnionType)
@@ -96,9 +96,9 @@ RECORDS: Final[Mapping[type[Record], Table]] = {
     WeighingDay: weighings,
 }
 
-# Collation that gives strings the same order in both databases.
+# Name of the collation by bytes, so that SQLite and PostgreSQL sort strings in the same order.
 _BYTE_ORDER: Final = {"sqlite": "BINARY", "postgresql": "C"}
-# Key of the advisory lock that all writers take: "ftdrive" in ASCII.
+# Key of the PostgreSQL advisory lock that every writer takes: "ftdrive" in ASCII.
 _WRITERS: Final = 0x66746472697665
 
 
@@ -121,7 +121,7 @@ class Database:
                     f"[store] url begins with {self._dialect}: give sqlite:////PATH or postgresql+psycopg://…"
                 )
             self._engine: Engine = create_engine(self._url, poolclass=NullPool, connect_args=self._limits())
-        except (ArgumentError, NoSuchModuleError, ValueError) as error:  # ValueError for a port that is not a number
+        except (ArgumentError, NoSuchModuleError, ValueError) as error:  # ValueError if the port is no number
             raise ConfigError("[store] url is not a database address: give one such as sqlite:////PATH") from error
         except ImportError as error:
             raise ConfigError(
@@ -130,13 +130,13 @@ class Database:
 
     @property
     def name(self) -> str:
-        """File, or address without its password."""
+        """Name of the database in messages: the file, or the address without its password."""
         return (self._is_sqlite and self._url.database) or self._url.render_as_string()
 
     @contextmanager
     def reading(self) -> Iterator[Connection | None]:
-        """Yield a connection for reading; None if there are no tables yet."""
-        if self._file is not None and not self._file.exists():  # a connection would create the file
+        """Yield a connection for reading; None if the database does not exist or has no tables yet."""
+        if self._file is not None and not self._file.exists():  # connecting would create the file
             yield None
             return
         with self._connected("read") as connection:
@@ -144,17 +144,17 @@ class Database:
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
-        """Yield a connection as the only writer, and commit at the end.
+        """Yield a connection that locks out other writers, and commit at the end of the block.
 
-        Missing tables are created. An index of an older version is replaced by an empty one; cells are kept.
+        Missing tables are created. Tables of an older version are replaced by empty ones, except for that of the cells.
         """
-        # All writers share one lock, because the row locks of two writers may cause a deadlock.
+        # Writers take one lock for the whole database, because row locks of two writers may cause a deadlock.
         if self._file is not None:
             with self._naming_store("written"):
                 self._file.parent.mkdir(parents=True, exist_ok=True)
         with self._connected("written") as connection:
             if self._is_sqlite:
-                connection.exec_driver_sql("BEGIN IMMEDIATE")  # two writers that both read first would block each other
+                connection.exec_driver_sql("BEGIN IMMEDIATE")  # a deadlock if two read first
             else:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _WRITERS})
             if self._version(connection) != SCHEMA:
@@ -165,7 +165,7 @@ class Database:
             connection.commit()
 
     def paths_of_older(self) -> set[str] | None:
-        """Return the paths in an index of an older version; None if there is no such index."""
+        """Return the paths of all records if the tables are of an older version; None otherwise."""
         with self.reading() as connection:
             return None if connection is None or self._version(connection) == SCHEMA else all_paths(connection)
 
@@ -183,8 +183,8 @@ class Database:
         return insert.on_conflict_do_update(index_elements=key, set_=new, where=where)
 
     def _version(self, connection: Connection) -> int | None:
-        """Return the version of the tables; 0 if it is missing, None if there are no tables."""
-        # There are no migrations, because an older index is rebuilt from the run folders.
+        """Return the version of the tables; 0 if none is stored, None if there are no tables. A newer one raises."""
+        # Tables of an older version are not migrated, because the store is rebuilt from the run folders.
         if not inspect(connection).has_table(schema.name):
             return None
         version = connection.scalar(select(schema.c.version)) or 0
@@ -197,12 +197,12 @@ class Database:
 
     @property
     def _file(self) -> Path | None:
-        """SQLite file; None for a server, an in-memory database, or a file: URI."""
+        """Path of the SQLite file; None for a server, an in-memory database, or a file: URI."""
         path = self._url.database or ""
         return Path(path) if self._is_sqlite and path and not path.startswith("file:") else None
 
     def _limits(self) -> dict[str, Any]:
-        """Return the driver's time-outs for locks and for a server that does not answer."""
+        """Return the arguments of the database driver for its time-outs for locks and a server that does not answer."""
         if self._is_sqlite:
             return {"timeout": self._wait_s}
         wait_s = max(2, round(self._wait_s))
@@ -234,7 +234,7 @@ class Database:
 
 
 def all_paths(connection: Connection) -> set[str]:
-    """Return the paths of all records in an index of any version."""
+    """Return the paths of all records in the database, whose tables may be of any version."""
     existing = {*inspect(connection).get_table_names()}
     tables = [table for table in RECORDS.values() if table.name in existing]
     return {path for table in tables for path in connection.scalars(select(table.c.path))}

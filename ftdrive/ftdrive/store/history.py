@@ -11,10 +11,10 @@ from ftdrive.store.records import StoredResult
 if TYPE_CHECKING:
     from ftdrive.store.trends import QuantityTrend
 
-# Largest age, in days, of a calibration or of its last verification without a warning.
+# Age, in days, above which a calibration that was not verified since gives a warning.
 OLD_DAYS: Final = 30.0
 OTHER_TEMPERATURE_K: Final = 10.0
-# Smallest number of results for a trend.
+# Smallest number of results of a tool for which trends are estimated.
 _FEWEST = 3
 
 
@@ -24,9 +24,9 @@ def age_days(created_utc: str | None, now: datetime) -> float | None:
 
 
 def drifts(results: Sequence[StoredResult]) -> list["QuantityTrend"]:
-    """Return the trends of each tool with at least three accepted results over three days or more."""
+    """Return the trends of bias and payload of each tool with three or more accepted results over at least 3 days."""
     long = [series for series in _series(results) if len(series) >= _FEWEST]
-    if not long:  # avoid importing numpy, which takes as long as the rest of the command
+    if not long:  # avoid the import of numpy, which doubles the time of the command
         return []
     from ftdrive.store.trends import trends_of
 
@@ -36,7 +36,7 @@ def drifts(results: Sequence[StoredResult]) -> list["QuantityTrend"]:
 def warnings(
     results: Sequence[StoredResult], verifications: Sequence[VerificationRecord], now: datetime
 ) -> Iterator[str]:
-    """Yield warnings about the newest calibration of each tool: old, failed, or made at another temperature."""
+    """Yield warnings about each tool's newest calibration: old, verification failed, or another temperature."""
     for series in _series(results):
         newest = series[-1]
         what = f"{newest.tool}: the newest calibration, {newest.id[:6]},"
@@ -56,7 +56,7 @@ def warnings(
 
 
 def _series(results: Sequence[StoredResult]) -> Iterator[list[StoredResult]]:
-    """Yield the accepted results for each tool on each arm, sensor and mount, the oldest first."""
+    """Yield a list, oldest first, of the accepted results of each combination of tool, arm, sensor and mount."""
 
     def cell(result: StoredResult) -> tuple[str, ...]:
         return tuple(str(part) for part in (result.tool, result.arm_serial, result.sensor_serial, result.mount))

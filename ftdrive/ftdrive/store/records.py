@@ -12,54 +12,54 @@ from ftdrive.runs.calibration import EMULATED, at, marks_of, number_at, numbers_
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.runs.weighings import FILES, FOLDER, WeighingDay
 
-# Listing results must not import numpy.
+# Only for type checkers: listing results must not import numpy, which takes long.
 if TYPE_CHECKING:
     from ftcalib.model import Array, Parameters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredResult:
-    """A calibration; values that its file lacks are None."""
+    """What the store keeps of a calibration; None for values that are not in its file or run."""
 
     id: str
     """Id of the result, see `CalibrationResult.id`."""
     path: str
     """Path of the calibration file."""
     run: str
-    """Name of the run folder."""
+    """Name of the run folder that contains the calibration."""
     created_utc: str | None
-    """UTC in ISO 8601 with microseconds, which sorts as text."""
+    """Time of the calibration, UTC, ISO 8601 with microseconds, which sorts as text."""
     tool: str | None
     arm_serial: str | None
     arm_model: str | None
     sensor_serial: str | None
     sensor_model: str | None
     robot_host: str | None
-    """Address of the controller in the run's configuration."""
+    """Address of the robot controller in the configuration of the run."""
     mount: str | None
     verdict: str
     n_poses: int
     mass_kg: float
     g_m_s2: float
     numbers: dict[str, JSON]
-    """Fields of `Parameters`, and `covariance`, as in the file."""
+    """The estimates and their covariance: the fields of `Parameters`, and `covariance`, as in calibration.json."""
     dataset_sha256: str | None
     parent: str | None
     """Id of the calibration that this one updates."""
     update: str | None
     """Kind of the update, such as "bias"; None for a full calibration."""
     temperature_C: float | None
-    """Temperature of the sensor; None if it reports none."""
+    """Temperature of the sensor, °C; None if the sensor reports none."""
     payload_kg: float | None
     """Payload that the controller reported during the calibration, kg."""
     payload_com_m: list[float] | None
-    """(3,) centre of mass of this payload, flange axes."""
+    """(3,) centre of mass, m, of the payload that the controller reported, flange axes."""
     emulated: bool = False
-    """Whether the cell was emulated."""
+    """Whether the calibration was made in an emulated cell."""
 
     @property
     def parameters(self) -> "Parameters":
-        """Estimates; with `covariance`, they make the record an `ftcalib.after.series.Estimated`."""
+        """Estimates as `Parameters`, so that the record has the interface `ftcalib.after.series.Estimated`."""
         import numpy as np
 
         from ftcalib.model import Parameters
@@ -68,18 +68,18 @@ class StoredResult:
 
     @property
     def covariance(self) -> "Array":
-        """(15, 15) covariance of the error coordinates `ftcalib.model.PARAMETER_NAMES`."""
+        """(15, 15) covariance of the estimates, in the error coordinates `ftcalib.model.PARAMETER_NAMES`."""
         import numpy as np
 
         return np.array(self.numbers["covariance"], dtype=np.float64)
 
     @property
     def mass_sigma_kg(self) -> float:
-        """Standard deviation of the mass, without the gain error, which is common to all results of a sensor."""
+        """Standard deviation of the mass, kg, without the sensor's gain error, which all its results have in common."""
         return self.parameters.weight_sigma_N(self.covariance) / self.g_m_s2
 
     def to_dict(self, age_days: float | None, check: VerificationRecord | None) -> dict[str, Any]:
-        """Return the record with its age and last verification as JSON."""
+        """Return the record as JSON, with its age and last verification `check`, each of which may be None."""
         import numpy as np
 
         from ftcalib.model import BIASES
@@ -99,11 +99,11 @@ class StoredResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredCell:
-    """A cell of a fleet. Run folders do not contain cells, so a rebuild of the store keeps them."""
+    """A cell of a fleet in the store. A rebuild of the store keeps the cells, because run folders do not have them."""
 
     name: str
     config: str
-    """Absolute path of the configuration file."""
+    """Absolute path of the configuration file of the cell."""
     verify_every_days: float
     arm_serial: str | None
     robot_host: str | None
@@ -112,7 +112,7 @@ class StoredCell:
 
 
 Record = StoredResult | VerificationRecord | WeighingDay
-# Fields of a verification that the store and the list of results contain.
+# Fields of a `VerificationRecord` that are stored, and printed with the list of results.
 STORED: Final = (
     *("id", "path", "run", "calibration_id", "created_utc", "passed", "change", "reason", "temperature_C"),
     *("bias_change", "bias_change_sigma", "calibration_sigma"),
@@ -120,7 +120,7 @@ STORED: Final = (
 
 
 def record_paths(folders: Iterable[Path]) -> list[Path]:
-    """Return the files in run folders, or in folders of runs, that become records. Weighings count as a run folder."""
+    """Return the files of results, verifications and weighings in run folders, or in folders that contain these."""
     folders = [folder.resolve() for folder in folders]
     weighings = (path for folder in folders for path in (folder, folder / FOLDER) if path.name == FOLDER)
     names = ("calibration*.json", "verification*.json", FILES)
@@ -129,7 +129,7 @@ def record_paths(folders: Iterable[Path]) -> list[Path]:
 
 
 def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
-    """Return the records in these files, and a description of each file that could not be read."""
+    """Read the record in each file; also return a text with path and error for each file that could not be read."""
     records, unreadable = list[Record](), list[str]()
     for path in paths:
         try:
@@ -140,9 +140,9 @@ def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
 
 
 def _read_record_file(path: Path) -> Record:
-    """Return the record in a file, ignoring unknown fields.
+    """Read a result, a verification or a day of weighings, by the name of the file, ignoring unknown fields.
 
-    Raises `BadCalibration` or `BadDataset` for a damaged file or another format, and `OSError`.
+    Raises `BadCalibration` or `BadDataset` for a damaged file or another format, and `OSError` if reading fails.
     """
     if path.match(FILES):
         return WeighingDay.load(path)
@@ -156,7 +156,7 @@ def _result(path: Path) -> StoredResult:
     result = CalibrationResult.load(path)
     try:
         header = Run(path.parent).header()
-    except (DataError, OSError):  # the calibration file alone is enough
+    except (DataError, OSError):  # such as a calibration without its run
         header = {}
     provenance, setup = result.provenance, at(result.provenance, "setup")
     named = provenance if at(provenance, "devices") else header

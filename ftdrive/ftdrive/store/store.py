@@ -16,7 +16,7 @@ from ftdrive.store import database
 from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import STORED, Record, StoredCell, StoredResult, read_records, record_paths
 
-# Time-out for another writer's lock, s.
+# Time-out of waiting for the lock of another writer, s.
 WAIT_S = 5.0
 
 _MOST = 5000
@@ -26,18 +26,18 @@ _Stored = TypeVar("_Stored")
 
 @dataclass(frozen=True, slots=True)
 class Indexed:
-    """Numbers of records that a call of `Store.index` read."""
+    """Numbers of records that `Store.index` or `Store.rebuild` has read and added."""
 
     results: int
     verifications: int
     weighings: int
     """Number of weighing files, one per day."""
     unreadable: tuple[str, ...]
-    """Descriptions of the files that could not be read."""
+    """Texts with path and error of the files that could not be read."""
 
 
 class Store:
-    """An index of run folders, and the cells of a fleet; the database is opened by the first method call.
+    """A database with an index of run folders and the cells of a fleet, opened at the first call of a method.
 
     `url` is the address of an SQLite file or a PostgreSQL database in the form of SQLAlchemy, by default a file in the
     user's data folder. `wait_s` is the time-out for another writer, and for a server that does not answer. Raises
@@ -48,11 +48,11 @@ class Store:
     def __init__(self, url: str | None = None, *, wait_s: float = WAIT_S) -> None:
         self._database = Database(url, wait_s)
         self.name = self._database.name
-        """File, or address without its password."""
+        """Name of the store in messages: the file, or the address without its password."""
 
     @cached_property
     def _current(self) -> Database:
-        """The database; an index of an older version is first rebuilt from the files that it names."""
+        """The database; if its tables are of an older version, they are first rebuilt from the files they name."""
         if (paths := self._database.paths_of_older()) is not None:
             records, _ = read_records(map(Path, sorted(paths)))
             with self._database.writing() as connection:
@@ -62,7 +62,7 @@ class Store:
     # -------------------------------------------------------------------------------------------------------- writing
 
     def index(self, *folders: Path) -> Indexed:
-        """Add the new files in these run folders, or in the run folders that they contain; return how many were added.
+        """Add the new files in run folders, or in folders that contain them; return how many were added.
 
         A file with a known path is not read again, because files of a run are never overwritten; a weighing file is
         read again if it has grown.
@@ -73,9 +73,9 @@ class Store:
         return self._add(path for path in paths if str(path) not in known)
 
     def rebuild(self, *folders: Path) -> Indexed:
-        """Read these folders and all indexed folders again, and remove deleted runs from the index.
+        """Read these folders and those of all indexed runs again, and remove deleted runs from the index.
 
-        Runs whose parent folder is not accessible are kept, because they may be on another disk or computer.
+        A missing run is kept if its parent folder is missing too, because it may be on another disk or computer.
         """
         with self._current.reading() as connection:
             known = set() if connection is None else all_paths(connection)
@@ -89,13 +89,13 @@ class Store:
             self._write(connection, [record])
 
     def put_cells(self, cells: Iterable[StoredCell]) -> None:
-        """Insert cells, replacing those with the same name; all of them or none."""
+        """Insert cells, replacing those with the same name; if that fails, no cell is changed."""
         if rows := [_to_row(cell) for cell in cells]:
             with self._current.writing() as connection:
                 connection.execute(self._database.upsert(database.cells), rows)
 
     def remove_cells(self, names: Iterable[str]) -> None:
-        """Remove cells by name; ignore unknown names."""
+        """Remove the cells with these names; ignore unknown names."""
         by_name = delete(database.cells).where(database.cells.c.name == bindparam("cell"))
         with self._current.writing() as connection:
             for name in names:
@@ -111,8 +111,8 @@ class Store:
         return Indexed(results, verifications, weighings, unreadable)
 
     def _write(self, connection: Connection, records: Sequence[Record], forget: Sequence[str] = ()) -> None:
-        """Insert records; for several files with the same content, store the path that sorts first."""
-        # The key is the content: a run that was copied or moved counts once, even on two computers.
+        """Insert records and delete those at the paths `forget`; of files with equal content, keep the first path."""
+        # The key of a record is its content, so that a copied or moved run counts once, even from two computers.
         for kind, table in database.RECORDS.items():
             rows = [_to_row(record) for record in records if isinstance(record, kind)]
             same = _paths_where(connection, table, table.c.id, [row["id"] for row in rows])
@@ -125,7 +125,7 @@ class Store:
     # -------------------------------------------------------------------------------------------------------- reading
 
     def results(self, tool: str | None = None) -> list[StoredResult]:
-        """Return all results, or the results of a tool, the oldest first."""
+        """Return all results, or those with the name of one tool, the oldest first."""
         table = database.results
         return self._read(_oldest_first(table).where(*_is(table.c.tool, tool)), _by_name(StoredResult))
 
@@ -135,7 +135,7 @@ class Store:
         return self._read(query, _by_name(StoredResult))
 
     def verifications(self, calibration_id: str | None = None) -> list[VerificationRecord]:
-        """Return all verifications, or the verifications of a calibration, the oldest first."""
+        """Return all verifications, or those of the calibration with this id, the oldest first."""
         table = database.verifications
         return self._read(_oldest_first(table).where(*_is(table.c.calibration_id, calibration_id)), _to_verification)
 
@@ -144,14 +144,14 @@ class Store:
         return next(reversed(self.verifications(calibration_id)), None)
 
     def weighings(self, most: int, tool: str | None = None) -> list[WeighingDay]:
-        """Return the last `most` daily records of weighings, with all tools or with one tool, the oldest first."""
+        """Return the last `most` records of weighings, each of one day, of all tools or one, the oldest first."""
         table = database.weighings
         newest_first = (table.c.day.desc(), table.c.last_utc.desc().nulls_last(), table.c.id)
         query = select(table).where(*_is(table.c.tool, tool)).order_by(*newest_first).limit(most)
         return self._read(query, _to_weighings)[::-1]
 
     def last_weighings(self, since_day: str, tool: str | None = None) -> list[WeighingDay]:
-        """Return the last weighing day of each tool on each arm since a day (ISO 8601, UTC), the oldest first."""
+        """Return, for each tool and arm, the last day with weighings since a day (ISO 8601, UTC), the oldest first."""
         return sum_up(self._read(_last_weighings(since_day, tool), _to_weighings))
 
     def cells(self) -> list[StoredCell]:
@@ -186,7 +186,7 @@ def _query(connection: Connection | None, query: Select[Any], make: Callable[[Ro
 
 
 def _paths_in_store(connection: Connection, paths: Sequence[Path]) -> set[str]:
-    """Return the paths of the files that are completely in the store."""
+    """Return those paths whose files are in the store, except weighing files that have grown since."""
     texts = [str(path) for path in paths]
     known = {
         path for table in database.RECORDS.values() for path in _paths_where(connection, table, table.c.path, texts)
@@ -201,7 +201,7 @@ def _paths_in_store(connection: Connection, paths: Sequence[Path]) -> set[str]:
 
 
 def _paths_where(connection: Connection, table: Table, column: Column[Any], values: Sequence[str]) -> Iterator[str]:
-    """Yield the paths of the rows that have one of the values in a column, in statements of limited size."""
+    """Yield the paths of the table's rows with one of the values in `column`, by several queries of limited length."""
     for start in range(0, len(values), _MOST):
         yield from connection.scalars(select(table.c.path).where(column.in_(values[start : start + _MOST])))
 
@@ -225,7 +225,7 @@ def _newest_accepted(most: int) -> Select[Any]:
 
 
 def _last_weighings(since_day: str, tool: str | None = None) -> Select[Any]:
-    """Return a query for the files of the last day with each tool on each arm."""
+    """Return a query for the weighing files of the last day of each combination of tool and arm."""
     table = database.weighings
     key = (table.c.tool, table.c.arm_serial, table.c.robot_host, table.c.emulated)
     rank = func.rank().over(partition_by=key, order_by=table.c.day.desc()).label("rank")
@@ -247,7 +247,7 @@ def _by_name(kind: Callable[..., _Stored]) -> Callable[[Row[Any]], _Stored]:
 
 
 def _to_verification(row: Sequence[Any]) -> VerificationRecord:
-    # Read columns by position, because access by name would double the time.
+    # columns are read by position, because access by name takes twice as long
     wrenches = [None if row[k] is None else list(row[k : k + 6]) for k in (8, 14, 20)]
     return VerificationRecord._make((*row[:6], None, None, *row[6:8], *wrenches))
 

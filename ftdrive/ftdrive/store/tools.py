@@ -15,21 +15,21 @@ from ftdrive.store.store import Store
 from ftdrive.store.trends import sensor_biases
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 
-# Folder searched in addition to the store, for runs that are not indexed yet.
+# Folder that is searched in addition to the store, for runs that are not in the store yet.
 RUNS = Path("runs")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tool:
-    """The calibration of a named tool."""
+    """The calibration that was found for a named tool, with what the store knows of the sensor."""
 
     calibration: CalibrationResult
     path: Path
     warnings: tuple[str, ...]
     temperature: BiasTemperature | None = None
-    """Dependence of the sensor's bias on its temperature; None unless it improves the prediction of other runs."""
+    """Dependence of the sensor's bias on temperature; None unless it was shown to predict the bias of other runs."""
     hour_change: Array | None = None
-    """(6,) standard deviation of the change of the bias in one hour, N and N·m; None without enough runs."""
+    """(6,) standard deviation of the bias change in one hour, N and N·m; None if there are too few runs to tell."""
 
 
 def calibration_of_tool(
@@ -41,11 +41,11 @@ def calibration_of_tool(
     url: str | None = None,
     force: bool = False,
 ) -> Tool:
-    """Return the newest accepted calibration of a tool, a `[tool] name`, on these devices and this `[sensor] mount`.
+    """Return the newest accepted calibration of a tool, a `[tool] name`, on this arm, sensor and `[sensor] mount`.
 
-    With `force`, if these devices have none, use the newest one of any devices, even if edited by hand. `url` is the
-    address of the store. Raises `ConfigError`, which names the tools calibrated on these devices, if there is no
-    calibration.
+    With `force`, if this arm and sensor have none, use the newest one of any, even if edited by hand. `url` is the
+    address of the store. If there is no calibration, raises `ConfigError`, whose message names the tools calibrated on
+    this arm and sensor.
     """
     store, warnings = Store(url), list[str]()
     results: list[StoredResult] = []
@@ -80,7 +80,7 @@ def calibration_of_tool(
 
 
 def _may_belong(result: StoredResult, arm: DeviceInfo, sensor: DeviceInfo) -> bool:
-    """Return whether a stored result may belong to the devices, according to the serial numbers."""
+    """Return whether no known serial number of a stored result differs from that of the arm or the sensor."""
     pairs: Iterable[tuple[str | None, str]] = ((result.arm_serial, arm.serial), (result.sensor_serial, sensor.serial))
     return all(made == now or made in {None, NOT_REPORTED} or now == NOT_REPORTED for made, now in pairs)
 
@@ -95,7 +95,7 @@ def _load_result(result: StoredResult, *, accept_edited: bool = False) -> Calibr
 def _of_sensor(
     store: Store, result: StoredResult, results: Iterable[StoredResult]
 ) -> tuple[BiasTemperature | None, Array | None]:
-    """Return the temperature dependence of the sensor's bias, and its change in one hour, from all its runs."""
+    """Return, from all runs of a result's sensor, the bias's temperature dependence and its change in one hour."""
     key = (result.sensor_serial, result.arm_serial, result.mount)
     of_sensor = [other for other in results if (other.sensor_serial, other.arm_serial, other.mount) == key]
     try:
@@ -108,7 +108,7 @@ def _of_sensor(
 
 
 def _failed(store: Store, result: StoredResult) -> Iterator[str]:
-    """Yield a warning if the last verification of a result failed."""
+    """Yield one warning if the last verification of a result failed, else nothing."""
     try:
         last = store.last_verification(result.id)
     except BadStore:

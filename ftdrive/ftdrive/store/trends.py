@@ -14,13 +14,13 @@ from ftcalib.rounding import with_sigma
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.records import StoredResult
 
-# Significance level of a trend.
+# Significance level: a trend with a p-value below this is significant.
 SIGNIFICANT: Final = 0.01
-# Shortest time span of a trend; a change per 30 days from a shorter span would be extrapolated too far.
+# Shortest time span of results for a trend, because its unit is the change per 30 days, a long extrapolation.
 SHORTEST_DAYS: Final = 3.0
 
 _MONTH_DAYS = 30.0
-# Time between two runs used to estimate the change of the bias in one hour, and the smallest number of such pairs.
+# The bias change in one hour is estimated from pairs of runs this far apart, h, and from at least this many pairs.
 _NEAR_H: Final = (0.25, 6.0)
 _FEWEST_PAIRS: Final = 3
 # Median of the chi-squared distribution with one degree of freedom.
@@ -34,14 +34,14 @@ _VECTORS: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QuantityTrend:
-    """Linear trend of a quantity over the results for one tool on one sensor, arm and mount."""
+    """Linear trend of a quantity, such as the bias, over the results for one tool on one sensor, arm and mount."""
 
     tool: str
     sensor_serial: str | None
     quantity: str
     unit: str
     trend: Trend
-    """Change per 30 days, in `unit`."""
+    """The fitted change per 30 days, in `unit`."""
 
     @property
     def is_significant(self) -> bool:
@@ -49,7 +49,7 @@ class QuantityTrend:
         return self.trend.p_value < SIGNIFICANT
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as JSON."""
+        """Return the trend as JSON."""
         return {
             "tool": self.tool,
             "sensor_serial": self.sensor_serial,
@@ -73,7 +73,7 @@ class QuantityTrend:
 
 
 def trends_of(series: Sequence[StoredResult]) -> Iterator[QuantityTrend]:
-    """Yield the trends of results for one tool on one arm, sensor and mount; the results are sorted by time."""
+    """Yield the trends over a series of results, sorted by time, for one tool on one arm, sensor and mount."""
     for quantity, unit, rows in _quantities(series):
         days = {row[0] for row in rows}
         if len(days) < FEWEST_ESTIMATES or max(days) - min(days) < SHORTEST_DAYS:
@@ -84,9 +84,9 @@ def trends_of(series: Sequence[StoredResult]) -> Iterator[QuantityTrend]:
 
 
 def _quantities(series: Sequence[StoredResult]) -> Iterator[tuple[str, str, list[tuple[float, Array, Array]]]]:
-    """Yield each quantity with its unit, and (days, value, covariance) for each result that estimates it.
+    """Yield each quantity with its unit, and (days since the first result, value, covariance) per result.
 
-    Left out are values equal to an earlier one, which an update copied, and values given as known, without variance.
+    Results that do not estimate the quantity are left out: an update copied an earlier value, or the value was given.
     """
     first = datetime.fromisoformat(str(series[0].created_utc))
     days = [(datetime.fromisoformat(str(result.created_utc)) - first).total_seconds() / 86400 for result in series]
@@ -110,7 +110,7 @@ def _estimated(
     return rows
 
 
-# Serial numbers of a sensor and of its arm, and the mount.
+# Serial numbers of sensor and arm, and the mount, to which a bias belongs.
 Mounted = tuple[str, str | None, str | None]
 
 
@@ -125,11 +125,11 @@ class _Run(NamedTuple):
 def sensor_biases(
     results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]
 ) -> dict[Mounted, tuple[BiasTemperature | None, Array | None]]:
-    """Return the temperature dependence of each sensor's bias and its change in one hour, each None if data are few.
+    """Return for each sensor the bias's temperature dependence and its change in one hour; None for too few data.
 
     The change is the standard deviation (6,), N and N·m, of a random walk, from at least three pairs of successive runs
-    of one tool that are 15 min to 6 h apart. The estimate is a median over pairs and axes, separately for force and
-    torque, which makes it robust against a moved cable.
+    with one tool that are 15 min to 6 h apart. The estimate is a median over pairs and axes, separately for force and
+    torque, so that single jumps of the bias, as from a moved cable, hardly change it.
     """
     runs = _runs(results, verifications)
     return {mounted: (_temperature(series), _hour_change(series)) for mounted, series in runs.items()}
@@ -156,7 +156,7 @@ def _hour_change(runs: Sequence[_Run]) -> Array | None:
 
 
 def _runs(results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]) -> dict[Mounted, list[_Run]]:
-    """Return the runs that estimate the bias of each sensor, the oldest first."""
+    """Return for each sensor the estimates of its bias by calibrations and verifications, the oldest first."""
     runs = dict[Mounted, list[_Run]]()
     made = dict[str, tuple[list[_Run], StoredResult]]()
     for result in results:

@@ -16,19 +16,19 @@ from ftdrive.runs.weighings import FOLDER, WeighingDay, append_weighings
 
 # Time between two writes to the store, s.
 EVERY_S: Final = 30.0
-# Time-out of the last write at the end of a program, s; that of the store is 5 s.
+# Time-out, s, of the last write at the end of a program, slightly longer than the store's time-out of 5 s.
 _GOODBYE_S: Final = 6.0
-# Largest number of lines waiting for the disk; if there are more, the oldest are lost.
+# Largest number of lines that wait for a slow disk; if there are more, the oldest are lost.
 _MOST_WAITING: Final = 1000
 _NOT_INDEXED: Final = "Weighings are saved, but not yet in the history"
-# A line in the log: its day and its content.
+# A weighing to log: its day (UTC), and the JSON values of its line.
 _Line = tuple[str, Mapping[str, JSON]]
 
 
 class WeighingLog:
-    """A log that writes in a separate thread, so that a slow disk or database never delays a stream.
+    """A log of weighings with a thread of its own for writing, so that a slow disk or database delays no stream.
 
-    A failed write is reported once, and its lines are written again with the next write. `origin` has `tool`,
+    A failed write is reported once, and its lines are written with the next one. `origin` has `tool`,
     `calibration_id`, `arm_serial`, `sensor_serial`, `robot_host` and `emulated`; `url` is the address of the store.
     `say` receives a sentence for the operator, from any thread. `folder` is by default in the user's data folder;
     `every_s` is the time between two writes to the store, s.
@@ -48,12 +48,12 @@ class WeighingLog:
         self._folder = folder or user_folder("data") / FOLDER
         self._lines = SimpleQueue[_Line | None]()
         self._waiting = list[_Line]()
-        # Day and path of the current file, and its content when last read.
+        # day and path of the file that is written now, and its content when last read for the store
         self._day, self._path = "", Path()
         self._read: WeighingDay | None = None
-        # Whether the file has lines that the store lacks.
+        # whether this file has lines that the store lacks
         self._is_new = False
-        # Whether the store may lack other files in the folder.
+        # whether the store may lack files of earlier programs
         self._lacks_older = True
         self._store: Any = None
         self._said = set[str]()
@@ -66,7 +66,7 @@ class WeighingLog:
         self._lines.put((t_utc[:10], {"t_utc": t_utc, **values}))
 
     def close(self) -> None:
-        """Write the remaining lines; wait a few seconds at most."""
+        """End the log: write the remaining lines, which may take a few seconds at most."""
         self._lines.put(None)
         self._thread.join(_GOODBYE_S)
 
@@ -86,7 +86,7 @@ class WeighingLog:
                 due_s = monotonic() + self._every_s
 
     def _next(self, timeout_s: float | None) -> list[_Line | None]:
-        """Wait for lines and return them; None marks the end."""
+        """Wait for lines to log, and return all that wait; None among them means that the log was closed."""
         try:
             lines = [self._lines.get(timeout=timeout_s)]
         except Empty:
@@ -117,11 +117,11 @@ class WeighingLog:
         self._attempt(_NOT_INDEXED, self._put_weighings)
 
     def _put_weighings(self) -> None:
-        # The store gets one row per file, because one row per weighing would be 6 million per cell and year.
+        # The store gets one row per daily file, because one per weighing would be 6 million per cell and year.
         if self._store is None:
             self._open()
         if self._lacks_older:
-            self._store.index(self._folder)  # files that are missing from the store because of an outage
+            self._store.index(self._folder)  # also add files that an unreachable store missed
             self._lacks_older = False
         self._read = WeighingDay.load(self._path, self._read)
         self._store.put_weighings(self._read)
