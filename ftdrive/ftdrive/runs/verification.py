@@ -219,7 +219,7 @@ class Verified:
         return self.verification.update
 
     def next_command(self, saved: Path | None, again: str = "") -> str:
-        """Return the next command to type; `saved` is the path of a saved update, `again` has further options."""
+        """Return the command to type next; `saved` is the path of a saved update, `again` are options to append."""
         if saved is not None:
             return f"ftdrive live --calibration {quote(str(saved))}{again}"
         if self.passed:

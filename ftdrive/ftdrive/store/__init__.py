@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def store_url() -> str | None:
-    """Return `[store] url` from the environment and the files; None for the user's default store."""
+    """Return `[store] url` from the environment or a file; None if it is not set, for the user's default store."""
     url: str | None = settings()["store.url"].value
     return url
 

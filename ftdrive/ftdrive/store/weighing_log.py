@@ -61,7 +61,7 @@ class WeighingLog:
         self._thread.start()
 
     def keep(self, values: Mapping[str, JSON]) -> None:
-        """Log a weighing from `ftdrive.stream.weighing.load_values`, or why there is none; return at once."""
+        """Log the values of a weighing, or of the reason for a missing mass, from `load_values`; return at once."""
         t_utc = self._now().isoformat(timespec="milliseconds")
         self._lines.put((t_utc[:10], {"t_utc": t_utc, **values}))
 

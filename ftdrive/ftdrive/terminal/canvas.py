@@ -24,7 +24,7 @@ from ftdrive.terminal.lines import FAINT, STRONG, Line
 from ftdrive.terminal.supervisor import Supervisor
 
 REFRESH_S = 0.1
-# Bytes per write; a longer write could block on a terminal with room for only part of it.
+# Number of bytes per write to the terminal; a longer write could block if the terminal accepts only a part.
 _CHUNK = 256
 
 
@@ -36,9 +36,9 @@ class Canvas(ABC):
 
     is_over = False
     failure: BaseException | None = None
-    """Error that ended reading."""
+    """Error that ended the reading of the stream; None if there is none."""
     cover: Sequence[Line] = ()
-    """Lines shown instead of the drawing until a key is pressed."""
+    """Lines that are shown instead of what `draw` returns until a key is pressed, such as the help."""
     entry: tuple[Callable[[str], object], str, str] | None = None
     """A text field in the last line: the function that receives the text, the hint, and the text typed so far."""
 
@@ -53,7 +53,7 @@ class Canvas(ABC):
 
     @abstractmethod
     def turns(self) -> Iterable[object]:
-        """Read a stream in turns until the screen `is_over`."""
+        """Iterate over turns, each of which reads the new data of the stream, until `is_over` is true."""
 
     @abstractmethod
     def act(self, key: str) -> None:
@@ -64,7 +64,7 @@ class Canvas(ABC):
         return Line("─ ", FAINT).add(self._address).add("  v", STRONG).add(" QR code", FAINT) if self._address else None
 
     def lines(self, width: int, height: int) -> list[Line]:
-        """Return `height` lines of `width` cells to show; raise the error that ended reading."""
+        """Return the `height` lines of `width` cells to show. Raises the error that ended the reading, if any."""
         if self.failure is not None:
             raise self.failure
         shown = self.draw(width, height)
@@ -72,7 +72,7 @@ class Canvas(ABC):
         lines += [Line().to(width)] * (height - len(lines))
         if self.entry is not None:
             _, hint, text = self.entry
-            # show the end of a long text
+            # show only the end of a text that is longer than the line
             line = Line(" ").add(text[-max(width - 3, 0) :]).add(" ", "reverse")
             lines[-1:] = [line.add("" if text else hint, FAINT).fit(width)]
         return lines
@@ -117,7 +117,7 @@ class Canvas(ABC):
             stack.enter_context(redirect_stderr(held))
             stack.enter_context(console.screen())
             keyboard = stack.enter_context(Keyboard(keys.fileno()))
-            # entered last, because a blocked terminal may delay the other contexts
+            # start to read last, because a blocked terminal may delay the contexts above
             stack.enter_context(self.reading())
             while not self.is_over:
                 rest = _send(fd, rest or self._changes(console, fd))
@@ -128,7 +128,7 @@ class Canvas(ABC):
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Read in another thread while the screen is shown, so that drawing does not delay the stream."""
+        """Read the stream in another thread while the screen is shown, so that drawing does not delay the stream."""
         thread = threading.Thread(target=self._read, name="reading", daemon=True)
         thread.start()
         try:
@@ -141,7 +141,7 @@ class Canvas(ABC):
         try:
             for _ in self.turns():
                 pass
-        except BaseException as error:  # the main thread raises it
+        except BaseException as error:  # raised by the main thread in `lines`
             self.failure = error
 
     @contextmanager
@@ -165,7 +165,7 @@ class Canvas(ABC):
             signal.raise_signal(number)
 
     def _changes(self, console: CommandConsole, fd: int) -> bytes:
-        """Return the bytes that draw the changed lines, or all lines if the size of the terminal has changed."""
+        """Return the bytes that redraw the changed lines, or all lines if the terminal's size has changed."""
         size = os.get_terminal_size(fd)
         # some terminals report the size 0
         width, height = size.columns or 80, size.lines or 24
@@ -183,7 +183,7 @@ class Canvas(ABC):
 
 
 def _send(fd: int, rest: bytes) -> bytes:
-    """Send the bytes that the terminal accepts until the next drawing is due; return the rest, so keys can be read."""
+    """Write as many bytes as the terminal accepts until the next drawing is due; return those that are left."""
     due_s = time.monotonic() + REFRESH_S
     while rest and (left_s := due_s - time.monotonic()) > 0 and select.select([], [fd], [], left_s)[1]:
         rest = rest[os.write(fd, rest[:_CHUNK]) :]

@@ -16,12 +16,12 @@ from rich.text import Text
 from ftdrive.terminal.text import NARROWEST, glue, unglue
 from ftdrive.words.text import as_typed, is_command, visible
 
-# A command that takes longer than this prints what it is doing, even to a pipe.
+# A command that takes longer than this, s, prints what it is doing, even if stderr is no terminal.
 _PATIENCE_S: Final = 2.0
 
 
 class CommandConsole(Console):
-    """A console with a setting for details (`-v`); `quiet` belongs to the base class."""
+    """A rich console for commands, with the setting `verbose` for `-v`; the base class already has `quiet`."""
 
     verbose = False
 
@@ -31,15 +31,15 @@ class CommandConsole(Console):
             yield one if one.control else Segment(visible(one.text), one.style)
 
     def on_broken_pipe(self) -> None:
-        """Leave the handling of a closed pipe to `ftdrive.cli.run`."""
+        """Raise `BrokenPipeError` instead of ending the program, because `ftdrive.cli` handles it."""
         raise BrokenPipeError
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print, with commands written as they must be typed."""
+        """Print objects; in texts, commands are written as they must be typed (such as after `uv run`)."""
         super().print(*(as_typed(one) if isinstance(one, str) else one for one in objects), **options)
 
     def print_next(self, *commands: str) -> None:
-        """Print the next steps: commands, each with a reason after it."""
+        """Print the commands to type next; after three spaces, each may have its reason."""
         if commands:
             self.print("Next", style="bold cyan")
         for command in commands:
@@ -70,19 +70,19 @@ def has_screen() -> bool:
 
 
 def message_console(as_json: bool) -> CommandConsole:
-    """Return the console for messages about a result: stdout, or stderr if `--json` writes to stdout."""
+    """Return the console for messages about a result: that of stdout, or, as `--json` uses stdout, that of stderr."""
     return messages if as_json else answer
 
 
 def print_address(words: str, address: str) -> None:
-    """Print an address after a text, or below it if the line is too short; unbroken, and as a link if possible."""
+    """Print a URL after a text, or on a line of its own if it would not fit. It is never broken, and may be a link."""
     if not messages.soft_wrap and len(words + address) > messages.width >= len(f"   {address}"):
         words = f"{words.rstrip()}\n   "
     messages.print(Text.assemble(words, (address, Style(link=address))), soft_wrap=True)
 
 
 def print_page(url: str, *, shared: bool) -> None:
-    """Print the address of a page, also as a QR code for other devices."""
+    """Print the address of a browser page; if it is `shared` with other devices, also as a QR code."""
     print_address("The page is shown until this command ends, at ", url)
     if shared:
         for row in qr_code(url):
@@ -91,7 +91,7 @@ def print_page(url: str, *, shared: bool) -> None:
 
 
 def qr_code(address: str) -> list[str]:
-    """Return the rows of an address's QR code, light on dark; this needs the extra `viz`, as the page does."""
+    """Return the rows of characters of an address's QR code, light on dark. Needs the extra `viz`, as the page does."""
     import segno
 
     code = StringIO()
@@ -100,7 +100,7 @@ def qr_code(address: str) -> list[str]:
 
 
 def indented(head: str | Text, words: str, console: Console = messages) -> Text:
-    """Return the head and the words; if lines must be broken, later ones are indented to the first word.
+    """Return `head` followed by `words`; if the text needs several lines, later ones start below the first word.
 
     Print the text with `soft_wrap`, so that a line with a command stays whole.
     """
@@ -118,9 +118,9 @@ def indented(head: str | Text, words: str, console: Console = messages) -> Text:
 
 @contextmanager
 def working(words: str) -> Iterator[Callable[[str], None]]:
-    """Show on a terminal what a command is doing; a pipe gets a single line after 2 s.
+    """Show what a command is doing while the block runs; if stderr is no terminal, print it once after 2 s.
 
-    Yields a function that changes the text.
+    Yields a function that changes the shown text.
     """
     if not messages.is_terminal:
         line = Timer(_PATIENCE_S, messages.print, [f" {words} …"])

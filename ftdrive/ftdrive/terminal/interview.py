@@ -1,4 +1,4 @@
-"""The questions of `ftdrive init` in a terminal, for values that are not known yet."""
+"""The questions of `ftdrive init` in a terminal; only values that are not known yet are asked."""
 
 import sys
 from collections.abc import Callable
@@ -32,14 +32,14 @@ class _Back(Exception):
 
 
 class Interview:
-    """Asks for missing answers in the terminal; with --yes, `draft` is None and the default answers are used."""
+    """Asks in the terminal for what a cell's description lacks. `draft` stores answers; with --yes, it is None."""
 
     def __init__(self, described: Description, draft: Path | None, again: str) -> None:
         self._described, self._draft, self._again = described, draft, again
         self._addresses: dict[str, str] = {}
 
     def take_draft(self, *, asked: bool) -> None:
-        """Use the answers saved in a draft; with `asked`, only if the user confirms."""
+        """Use the answers that an earlier call saved in the draft; with `asked`, only if the user confirms."""
         if self._draft is None or not self._draft.exists():
             return
         when = saved_at(self._draft)
@@ -69,11 +69,11 @@ class Interview:
                 self._described.answered.add(question.key)
 
     def look(self, key: str, text: str) -> None:
-        """Read a device, and print its report. Raises the errors of `Description.look`."""
+        """Read the device at an address, and print what it reports. Raises the errors of `Description.look`."""
         say(self._described.look(key, text), "  ✔ ")
 
     def run(self) -> None:
-        """Ask until all questions are answered and the summary is confirmed."""
+        """Ask until all questions are answered and the user has confirmed the list of answers."""
         if self._draft is not None:
             say("Numbers may have a unit, such as 3.3 cm or 450 g. Enter 'back' for the previous question.")
         while True:
@@ -112,7 +112,7 @@ class Interview:
         return texts[0] if texts else self._described.usual(question)
 
     def _answer_rows(self, question: CellQuestion) -> None:
-        """Ask for rows until an empty answer; "back" removes the last row."""
+        """Ask a question with several answers, such as boxes, until an empty one; "back" removes the last."""
         described = self._described
         rows = described.texts.setdefault(question.key, [])
         if question.key == WALLS and self._draft is not None:
@@ -168,9 +168,9 @@ class Interview:
             text = None
 
     def _confirmed(self) -> bool:
-        """Show all answers; return whether to write them, or False if the user typed a number to reopen a question.
+        """Show all answers. Return True to write them, and False to ask the question again whose number was typed.
 
-        Raises `_Back` to repeat the last question.
+        Raises `_Back` if "back" was typed, to repeat the last question.
         """
         described = self._described
         questions = described.questions
@@ -191,7 +191,7 @@ class Interview:
         return not number
 
     def _ask(self, question: CellQuestion, words: str, usual: str | None) -> str:
-        """Return a valid answer; "" means no more rows. Enter and --yes use the default `usual`."""
+        """Return a valid answer; "" ends the answers of a question with several. Enter and --yes give `usual`."""
 
         def accept(text: str) -> None:
             if question.repeats and not text:
@@ -210,7 +210,7 @@ class Interview:
     def _until(
         self, words: str, usual: str | None, what: str, accept: Callable[[str], None], *, back: bool = True
     ) -> str:
-        """Ask until an answer is accepted. Raises the errors of `_prompt`, and `_Back` for "back"."""
+        """Ask until `accept` raises no error for the answer. Raises the errors of `_prompt`, and `_Back` for "back"."""
         while True:
             answer = self._prompt(words, usual, what)
             if back and answer.strip().lower() == "back":
@@ -223,12 +223,12 @@ class Interview:
                 return answer
 
     def _prompt(self, words: str, usual: str | None, what: str) -> str:
-        """Ask once. Raises `ConfigError` at the end of the input, and `click.Abort` after Ctrl-C."""
+        """Read one answer. Raises `ConfigError` at the end of the input, and `click.Abort` after Ctrl-C."""
         shown = in_whole_words(words, sys.stderr)
         try:
             return str(click.prompt(visible(shown), default=usual, show_default=False, prompt_suffix="", err=True))
         except click.Abort as abort:
-            # start a new line for the next message
+            # end the line of the prompt before the next message
             echo(err=True)
             kept = ""
             if self._draft is not None and self._draft.exists():
@@ -246,5 +246,5 @@ def _yes_or_no(answer: str) -> None:
 
 
 def say(words: str, head: str = "") -> None:
-    """Print on stderr; lines after the first are indented to the first word after the head."""
+    """Print `head` and `words` on stderr; if the text needs several lines, later ones start below the first word."""
     messages.print(indented(head, words), soft_wrap=True)

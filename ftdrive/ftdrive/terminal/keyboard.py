@@ -1,4 +1,4 @@
-"""Single keys from a terminal, without Enter. Ctrl-C still interrupts; all other keys reach only the screen."""
+"""Single keys from a terminal, without Enter. Ctrl-C still interrupts; other keys have no effect on the process."""
 
 import atexit
 import codecs
@@ -14,38 +14,38 @@ from typing import Self
 
 from ftdrive.session.events import Key
 
-# Arrows and function keys arrive as escape sequences, whose letters would be read as keys.
+# Arrow and function keys arrive as escape sequences, whose letters must not be read as keys.
 _ESCAPE = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|O.|.)?")
 _STROKE = re.compile(f"{_ESCAPE.pattern}|[^\x1b]")
 _NAMES = {"\x1b": "escape", "\n": "enter", "\r": "enter", "\x7f": "backspace", "\b": "backspace"}
 _NAMES |= {f"\x1b{mode}{letter}": name for mode in "[O" for letter, name in (("C", "right"), ("D", "left"))}
 _KEYS = {key.value: key for key in Key}
-# A letter typed within this time of another one belongs to a word, such as a late answer, s.
+# Letters typed within this time of each other, s, are a word, such as a late answer, and no single keys.
 _WORD_S = 0.3
-# Keys that take effect even within a word, because an unnecessary stop is harmless; others become `Key.OTHER`.
+# Keys that count even within a word, because an unneeded stop is harmless; other letters become `Key.OTHER`.
 _ALWAYS = {Key.PAUSE, Key.STOP}
 
 
 class Keyboard:
-    """Keys of a terminal, read by a thread. The terminal settings are restored on every exit from the context.
+    """Keys of a terminal, read by a thread. Every exit from the context restores the settings of the terminal.
 
-    A session reads requests (`pressed`), which exclude letters within words. Other screens read each keystroke
-    (`stroke`). `fd` is the descriptor of a terminal; see `usable`.
+    A session reads requests by `pressed`, which leaves out letters within words. Other screens read each keystroke by
+    `stroke`. `fd` is the descriptor of a terminal for which `usable` is true.
     """
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
         self._keys: deque[Key] = deque()
-        self._strokes: deque[str] = deque(maxlen=1000)  # a session does not read strokes
+        self._strokes: deque[str] = deque(maxlen=1000)  # limited, because a session does not read strokes
         self._before: list[int | list[bytes | int]] | None = None
         self._thread: Thread | None = None
         self._wake = -1
 
     @staticmethod
     def usable(fd: int) -> bool:
-        """Whether keys can be read from a descriptor: a terminal in the foreground, not a pipe or a background job.
+        """Whether keys can be read from a descriptor: that of a terminal, with the program in its foreground.
 
-        False on Windows, which lacks `termios`.
+        False on Windows, which lacks the module `termios`.
         """
         if not hasattr(os, "tcgetpgrp"):
             return False
@@ -62,21 +62,21 @@ class Keyboard:
         self._stop()
 
     def pressed(self) -> Key | None:
-        """Return the oldest unread request; None if there is none."""
+        """Return the oldest key of a session that was not returned yet; None if there is none."""
         return self._keys.popleft() if self._keys else None
 
     def stroke(self) -> str | None:
-        """Return the oldest unread keystroke, as a character or a name such as "left"; None if there is none."""
+        """Return the oldest keystroke not returned yet, as a character or a name such as "left"; None for no key."""
         return self._strokes.popleft() if self._strokes else None
 
     @property
     def waiting(self) -> tuple[Key, ...]:
-        """Unread requests."""
+        """Keys of a session that `pressed` has not returned yet."""
         return tuple(self._keys)
 
     @contextmanager
     def suspended(self) -> Iterator[None]:
-        """Restore the terminal for a typed answer, and discard earlier keys."""
+        """Stop reading keys while the block runs, so that it can read a typed answer; discard earlier keys."""
         self._stop()
         try:
             yield
@@ -94,9 +94,9 @@ class Keyboard:
         atexit.register(self._restore)
         tty.setcbreak(self._fd, termios.TCSANOW)
         mode = termios.tcgetattr(self._fd)
-        # Ctrl-S would freeze the screen while the arm moves
+        # disable Ctrl-S, which would freeze the screen while the arm moves
         mode[0] &= ~termios.IXON
-        # Ctrl-Z would suspend the guards, and Ctrl-\ end them
+        # disable Ctrl-Z and Ctrl-\, which would suspend or end the guards of a moving arm
         for name in (termios.VSUSP, termios.VQUIT):
             mode[6][name] = b"\0"
         termios.tcsetattr(self._fd, termios.TCSANOW, mode)
@@ -121,7 +121,7 @@ class Keyboard:
 
         # a closed terminal need not be restored
         with suppress(termios.error):
-            # now, because TCSADRAIN would wait for Ctrl-Q after Ctrl-S
+            # TCSANOW, because TCSADRAIN would wait for Ctrl-Q if Ctrl-S was pressed
             termios.tcsetattr(self._fd, termios.TCSANOW, self._before)
             termios.tcflush(self._fd, termios.TCIFLUSH)
         self._before = None
@@ -129,7 +129,7 @@ class Keyboard:
 
     def _read(self, wake: int) -> None:
         word, typed_s = "", 0.0
-        # the bytes of a character can arrive in two parts
+        # incremental, because two reads may split the bytes of a character
         decoder = codecs.getincrementaldecoder("utf-8")("replace")
         try:
             while True:

@@ -17,7 +17,7 @@ TRACE, CONTACT, FAINT, STRONG = "green", "magenta", "dim", "bold"
 
 
 class Part(NamedTuple):
-    """A piece of a line with one style."""
+    """A piece of a line of text with one style."""
 
     text: str
     style: str = ""
@@ -42,7 +42,7 @@ class Line:
         return self
 
     def to(self, column: int) -> Self:
-        """Append spaces up to a column."""
+        """Append spaces until the line has `column` cells."""
         return self.add(" " * (column - self.width))
 
     def join(self, other: "Line") -> Self:
@@ -52,7 +52,7 @@ class Line:
         return self
 
     def fit(self, width: int) -> "Line":
-        """Return this line padded to `width` cells, or as many of its words as fit before an ellipsis."""
+        """Return this line with exactly `width` cells: padded with spaces, or cut after a word, with an ellipsis."""
         if self.width <= width:
             return self.to(width)
         fitted = Line()
@@ -60,7 +60,7 @@ class Line:
             room = width - 1 - fitted.width
             if cell_len(part.text) > room:
                 text = set_cell_size(part.text, max(room, 0))
-                # only whole words
+                # cut back to whole words
                 if not part.text.startswith(" ", len(text)):
                     text = text[: text.rfind(" ") + 1]
                 fitted.add(text, part.style)
@@ -70,7 +70,7 @@ class Line:
 
     @classmethod
     def of_cells(cls, text: Sequence[str], styles: Sequence[str]) -> Self:
-        """Return a line of characters, each with its style."""
+        """Build a line of characters, the i-th of which has the i-th style."""
         line = cls()
         for style, alike in groupby(zip(text, styles, strict=True), key=lambda cell: cell[1]):
             line.add("".join(character for character, _ in alike), style)
@@ -86,15 +86,15 @@ class Line:
 
 Dots = NDArray[np.bool_]
 
-# Bit of each dot in a character, by row and column (Unicode block U+2800).
+# Bit of each dot in the code of a Braille character, by row and column (Unicode block U+2800).
 _BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.uint32)
 
 
 def envelope(low: Array, high: Array, rows: int, full: float) -> Dots:
-    """Return dots (4 rows, n) for the ranges from `low` to `high` (n,), without gaps between neighbours.
+    """Draw the ranges from `low` to `high` (n,) as dots (4 rows, n), without vertical gaps between neighbours.
 
-    A column with NaN stays empty. The upper edge is `full`, the lower edge -`full`; values beyond an edge are drawn at
-    the edge.
+    A column with NaN stays empty. The upper edge is the value `full`, the lower edge -`full`; values beyond an edge are
+    drawn at the edge.
     """
     low, high = low.copy(), high.copy()
     joined = np.isfinite(low[1:]) & np.isfinite(low[:-1])
@@ -109,7 +109,7 @@ def envelope(low: Array, high: Array, rows: int, full: float) -> Dots:
 
 
 def characters(dots: Dots) -> NDArray[np.str_]:
-    """Return dots (4 m, 2 n) packed into characters (m, n), blank without dots."""
+    """Pack dots (4 m, 2 n) into Braille characters (m, n); a character without dots is a space."""
     rows, columns = len(dots) // 4, dots.shape[1] // 2
     codes = np.einsum("ribj,ij->rb", dots.reshape(rows, 4, columns, 2).astype(np.uint32), _BITS)
     return np.where(codes, 0x2800 + codes, ord(" ")).astype(np.uint32).view("U1")
@@ -118,7 +118,7 @@ def characters(dots: Dots) -> NDArray[np.str_]:
 def plot(
     low: Array, high: Array, rows: int, full: float, in_contact: NDArray[np.bool_], under: Dots | None = None
 ) -> list[Line]:
-    """Return an `envelope`, drawn over the dots `under`, as lines of n / 2 characters; contacts are coloured."""
+    """Draw ranges (n,) as in `envelope`, over the dots `under`, as lines of n / 2 characters; contacts are coloured."""
     ink = characters(envelope(low, high, rows, full))
     drawn, cells = ink != " ", ink if under is None else np.where(ink != " ", ink, characters(under))
     styles = np.where(drawn, np.where(in_contact, CONTACT, TRACE), FAINT)
@@ -126,5 +126,5 @@ def plot(
 
 
 def _dot(value: Array, rows: int, full: float) -> Array:
-    """Return the dot row of each value, 0 at the top; values near zero are in the row below the middle."""
+    """Return in which row of dots, 0 at the top, each value is drawn; zero is in the row below the middle."""
     return np.floor((1 - value / full) * 2 * rows + 0.5)

@@ -21,16 +21,16 @@ from ftdrive.words import stream as words
 from ftdrive.words.stream import ShownWrench, View
 from ftdrivers.interfaces import Array
 
-# Width of the numbers in the table, in cells.
+# Width of a table row's name and numbers, in cells; bars and traces are to their right.
 _NUMBERS = 37
 _ARROWS = "→↗↑↖←↙↓↘"
-# Number of the first stage that applies to a sensor alone.
+# Number of the first stage that also applies to a sensor without an arm: the low-pass filter.
 _LOWPASS = 4
-# Width of a hemisphere, in cells.
+# Width of a drawn hemisphere, in cells.
 _DISC = 16
 _STATE = {"ok": ("✔", GOOD), "warning": ("!", WARNING), "failed": ("✘", BAD), "skipped": ("-", FAINT)}
 _TONES = {"good": GOOD, "warning": WARNING, "bad": BAD}
-# Styles of notes by kind.
+# Colours of the notes about events, by the kind of the event.
 _NOTES = {"contact": CONTACT, "mark": STRONG}
 _NOTES |= dict.fromkeys(("tare", "recovered"), GOOD) | dict.fromkeys(("drift", "warning"), WARNING)
 _NOTES |= dict.fromkeys(("tare-refused", "gap", "stale", "failed"), BAD)
@@ -40,7 +40,7 @@ _NOTES |= dict.fromkeys(("tare-refused", "gap", "stale", "failed"), BAD)
 
 
 def head_lines(view: View, width: int, page: Line | None = None) -> list[Line]:
-    """Return the lines with devices, stages, calibration, and the device without samples or the browser page."""
+    """Return the top lines: devices; stages; calibration; the device without samples, if any, or the page's address."""
     rule = Line() if page is None else page.add(" ")
     rule.add("─" * (width - rule.width), FAINT)
     if view.silent:
@@ -97,7 +97,7 @@ def _provenance(view: View, width: int) -> Line:
 
 
 def component_table(view: View, width: int, *, with_trace: bool) -> list[Line]:
-    """Return the table of components with sigma, extremes, a bar and, if there is room, a trace."""
+    """Return the table of the wrench components, with sigma, extremes and a bar, and a trace if there is room."""
     trace_cells = width - _NUMBERS - 23 - 4 if with_trace else 0
     if trace_cells < 8:
         trace_cells = 0
@@ -133,19 +133,19 @@ def component_table(view: View, width: int, *, with_trace: bool) -> list[Line]:
 
 
 def format_component(reading: ShownWrench, i: int) -> tuple[str, str]:
-    """Return the value of a component and its sigma, with the same number of decimals."""
+    """Return texts of wrench component i and of its sigma, with the same number of decimals."""
     places = _decimals(reading, i // 3 * 3)
     return _fit_number(reading.wrench[i], places, 8), _digits(reading.sigma[i], places)
 
 
 def _decimals(reading: ShownWrench | None, first: int) -> int:
-    """Return the number of decimals that can show the sigmas of three components without contact."""
+    """Return the number of decimals for force (`first` 0) or torque (3) that shows their sigmas without contact."""
     usual = 3 if first else 2
     return usual if reading is None or not reading.rest_sigma[first : first + 3].max() < 0.5 * 10**-usual else usual + 1
 
 
 def _component_row(view: View, name: str, now: tuple[str, str], peaks: str) -> Line:
-    """Return a line with name, current value, sigma and extremes; an old value is not shown as current."""
+    """Return a line with name, current value, sigma and extremes; while no samples arrive, dashes replace the value."""
     line = Line(name, STRONG)
     if view.live is None:
         return line.add(f"{'--.--':>8}", BAD if view.silent else FAINT).add(f"{'--':>8}", FAINT).add(peaks)
@@ -161,7 +161,7 @@ def _at_rest(view: View) -> Line:
 
 
 def _digits(sigma: float, places: int) -> str:
-    """Return a standard deviation with a fixed number of decimals, so that columns stay aligned; "--" if NaN."""
+    """Format a standard deviation with `places` decimals, so that columns stay aligned; NaN becomes "--"."""
     return "--" if np.isnan(sigma) else f"{sigma:.{places}f}"
 
 
@@ -206,7 +206,7 @@ def _contact_line(view: View) -> Line:
 
 
 def links(view: View) -> list[Line]:
-    """Return lines with the direction of gravity in tool axes, raw wrench, share of range, links and payload."""
+    """Return lines with gravity's direction in tool axes, raw wrench, share of range, rates of the devices, payload."""
     if view.info.is_raw:
         return [_raw(view), _range(view), _link_line(view, "sensor", view.status.sensor)]
     dial = [""] * 5
@@ -267,7 +267,7 @@ def _check_line(check: Check) -> Line:
 
 
 def other_wrench_lines(view: View) -> list[Line]:
-    """Return lines with the wrench after fewer stages and in other frames."""
+    """Return lines with the wrench after only some of the compensation stages, and in other frames."""
     if view.reading is None or not (rows := words.other_wrenches(view)):
         return []
     lines = [Line(f" in {words.short_frame(view.reading.frame)}", FAINT).to(21)]
@@ -285,7 +285,7 @@ def other_wrench_lines(view: View) -> list[Line]:
 
 
 def sphere(view: View) -> list[Line]:
-    """Draw gravity in flange axes on two hemispheres, with the calibrated orientations and the sigma."""
+    """Draw the directions of gravity in flange axes, now and at the calibrated poses, on two hemispheres, and sigma."""
     reading = view.reading
     if reading is None or view.info.is_raw:
         return []
@@ -333,7 +333,7 @@ def identity(view: View, width: int) -> list[Line]:
         lines.insert(0, Line(" arm       ", FAINT).add(who(info.arm)))
         lines.append(Line(" cal       ", FAINT).add(info.calibration_name))
     for check in view.checks:
-        # shown next to the links
+        # omitted here, because `links` already shows it
         if check.name == "robot.payload" and check.state == "ok":
             continue
         mark, *found = _check_line(check).parts
@@ -342,7 +342,7 @@ def identity(view: View, width: int) -> list[Line]:
 
 
 def events(view: View, width: int, rows: int) -> list[Line]:
-    """Return lines with the newest events first; if `rows` is small, several events share a line."""
+    """Return `rows` lines with the newest events first; if `rows` is at most 3, short events share a line."""
     lines = list[Line]()
     for note in view.notes:
         if len(lines) > rows:
@@ -356,7 +356,7 @@ def events(view: View, width: int, rows: int) -> list[Line]:
 
 
 def newest_rows(view: View, width: int) -> int:
-    """Return the number of lines that the newest event takes."""
+    """Return the number of lines that the newest event needs; 0 without events."""
     return next((len(_event_lines(view, note, width)) for note in view.notes), 0)
 
 
@@ -380,7 +380,7 @@ def _hanging(head: Line, parts: Sequence[Part], width: int) -> list[Line]:
 
 
 def keys(view: View, width: int) -> Line:
-    """Return a line that lists the keys."""
+    """Return a line that lists the keys of the live screen, as many as fit."""
     names = ["t tare", "u undo", "x axes", "a about", "1-4 stage", "z freeze", "b mark", "r rec", "p peak", "g span"]
     if view.info.is_raw:
         names = ["t tare", "u undo", "4 low-pass", "z freeze", "b mark", "r rec", "p peak", "g span"]
@@ -399,10 +399,10 @@ def keys(view: View, width: int) -> Line:
 
 
 def show_table(views: Iterable[View]) -> None:
-    """Show each view as a table, without keys and events, until the views end or the operator interrupts."""
+    """Show each view of a stream as a table, without keys and events, until they end or the operator interrupts."""
     shown = Group()
     with (
-        # an echoed Enter would break the screen
+        # read keys only so that the terminal does not echo them: an echoed Enter would break the screen
         Keyboard(0) if Keyboard.usable(0) else nullcontext(),
         Live(console=answer, refresh_per_second=10) as screen,
     ):

@@ -1,4 +1,4 @@
-"""The live screen: the compensated wrench in a terminal, with keys.
+"""The full-screen view of `ftdrive live`: the compensated wrench in a terminal, with keys.
 
 `Feed` reads the stream in a thread. Ten times per second, `StreamSummary` takes the new data, and `draw_live` draws its
 `View` as lines.
@@ -71,18 +71,18 @@ def run_live(feed: Feed, checks: Sequence[Check] = (), address: str = "") -> Non
 
 
 class LiveScreen(Canvas):
-    """Full-screen display of a `Feed`."""
+    """Full-screen display of the stream of a `Feed`, with keys."""
 
     def __init__(self, feed: Feed, summary: StreamSummary, address: str = "") -> None:
         super().__init__(address)
         self._feed, self._summary = feed, summary
 
     def draw(self, width: int, height: int) -> list[Line]:
-        """Draw the current state."""
+        """Return the lines that show the current state of the stream."""
         return draw_live(self._summary.view(), width, height, self.page())
 
     def turns(self) -> Iterator[object]:
-        """Read the stream for the screen and the page."""
+        """Read the stream, for the screen and the browser page, until the screen is over."""
         return self._feed.turns(until=lambda: self.is_over)
 
     def act(self, key: str) -> None:
@@ -134,13 +134,13 @@ def _actions(feed: Feed) -> dict[str, Callable[[], object]]:
 # At this width or more, the plots are drawn to the right of the table.
 _WIDE = 120
 _LEFT = 78
-# Width of a plot's scale, in cells.
+# Width of the labels at the left of a plot, in cells.
 _GUTTER = 7
 _LEAST_PLOT_ROWS, _LEAST_EVENTS = 3, 3
 
 
 def draw_live(view: View, width: int, height: int, page: Line | None = None) -> list[Line]:
-    """Return the screen as `height` lines of `width` cells; `page` is the line with the address of a page."""
+    """Return the live screen as `height` lines of `width` cells; `page` is the line with the browser page's address."""
     head = live_panels.head_lines(view, width, page)
     foot = live_panels.keys(view, width)
     rows = max(0, height - len(head) - 1)
@@ -155,7 +155,7 @@ def _narrow_layout(view: View, width: int, rows: int) -> list[Line]:
         plot_rows = min(7, (rows - len(body) - 10) // 3)
         body += _plots(view, width, 3 * plot_rows, across=2)
     links = [separator, *live_panels.links(view)]
-    # leave room for the whole newest event, such as a refused tare
+    # leave the panel out unless the whole newest event, such as a refused tare, still fits below it
     if rows - len(body) - len(links) - 1 >= max(1, live_panels.newest_rows(view, width)):
         body += links
     if rows - len(body) >= 20:
@@ -182,7 +182,7 @@ def _wide_lines(view: View, width: int, rows: int) -> list[Line]:
 
 
 def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
-    """Return all six plots in `rows` lines; the last line is the time axis."""
+    """Draw the plots of all six components, `across` side by side, in `rows` lines; the last one is the time axis."""
     each, cells = (rows - 1) // (6 // across), width // across - _GUTTER - 1
     if each < 2 or cells < 8:
         return []

@@ -14,14 +14,14 @@ from ftdrive.terminal.text import in_whole_words
 from ftdrive.words.session import SessionText
 from ftdrive.words.text import TextLine, visible
 
-# Letters and words that mean the same in every question; s and r never stand for a word that moves an arm.
+# Short answers and the words for which they stand in every question. No word that moves an arm has a short form.
 _SAME: Final = {"y": "yes", "n": "no", "q": "quit", "quit": "q", "skip": "s", "redo": "r"}
 
 
 def match_answer(question: Question, typed: str) -> str | None:
-    """Return the answer that was typed; None if the text is not an answer.
+    """Return the answer to a question that a typed text gives; None if the text is not an answer.
 
-    If a word must be typed exactly, "no" raises `Declined`.
+    If the question has only one answer, a word that must be typed exactly, "no" raises `Declined`.
     """
     typed = typed.strip()
     if typed in question.answers:
@@ -35,14 +35,14 @@ def match_answer(question: Question, typed: str) -> str | None:
 
 
 def prompt(question: Question) -> str:
-    """Return the question, followed by the possible answers unless the text already contains them."""
+    """Return the text of a question, with the possible answers unless it already names the only one."""
     if len(question.answers) == 1 and question.answers[0] in question.text:
         return f"{question.text}: "
     return f"{question.text} [{'/'.join(answer or 'Enter' for answer in question.answers)}] "
 
 
 def not_an_answer(question: Question, typed: str) -> str:
-    """Return why a line is not an answer, and what to type; a single key never stands for a word that moves an arm."""
+    """Return a message that a typed line is not an answer to the question, and what to type instead."""
     word = typed.strip()
     named = [answer for answer in question.answers if answer]
     if len(question.answers) == 1 and word.lower() == named[0].lower():
@@ -54,7 +54,7 @@ def not_an_answer(question: Question, typed: str) -> str:
 
 
 def read_answer(supervisor: Supervisor, question: Question) -> str:
-    """Read one line. Raises the errors of `Supervisor.read_line`."""
+    """Read the line that answers a question. Raises the errors of `Supervisor.read_line`."""
     return supervisor.read_line(
         f"no answer to '{prompt(question).strip()}': run the command in a terminal, or answer on standard input"
     )
@@ -73,7 +73,7 @@ class _Keyless:
 
 
 class JsonOperator(_Keyless):
-    """Writes one JSON object per line to stdout for every event and question; answers come from stdin.
+    """Operator for scripts: writes each event and question to stdout as a line of JSON, and reads answers from stdin.
 
     A question is the object `{"event": "question", "text", "answers", "error"}`. The next line of stdin is its answer.
     `error` is the reason for rejecting the previous line, or null.
@@ -85,7 +85,7 @@ class JsonOperator(_Keyless):
         self._lock = Lock()
 
     def show(self, event: Event) -> None:
-        """Write the event."""
+        """Write an event as a line of JSON."""
         self._write(event.to_dict())
 
     def ask(self, question: Question) -> str:
@@ -115,9 +115,9 @@ class JsonOperator(_Keyless):
 
 
 class PlainOperator(_Keyless):
-    """Plain lines on stderr, without colours or keys; `verbose` is that of `SessionText`.
+    """Operator that reads plain lines on stderr, without colours or keys; for `verbose`, see `SessionText`.
 
-    With `quiet`, lines are printed only before a question that may refer to them.
+    With `quiet`, lines are printed only before the next question, which may refer to them.
     """
 
     def __init__(
@@ -131,26 +131,26 @@ class PlainOperator(_Keyless):
         self._asked = ""
 
     def show(self, event: Event) -> None:
-        """Write the lines of the event."""
+        """Write the lines of text about an event."""
         if isinstance(event, Asked) and event.question == self._asked:
             # the question and the answer are already printed
             return
         self._write_lines(self._text.lines(event))
 
     def ask(self, question: Question) -> str:
-        """Return the answer from stdin, ignoring keys typed earlier in a terminal. Raises `Declined` at its end."""
+        """Return the answer from stdin; a terminal's earlier input is discarded. The end of stdin raises `Declined`."""
         self.supervisor.expect_answer()
         self._asked = question.text
         self.finish()
         quiet, self._quiet, withheld, self._withheld = self._quiet, False, self._withheld, []
         self._write_lines(withheld)
         self._quiet = quiet
-        # Input typed before the question might confirm a motion that had not been shown yet.
+        # discard input typed before the question, which might confirm a motion that had not been shown yet
         if self._stdin.isatty():
-            # Windows cannot discard early input, so no answer is read there
+            # the import fails on Windows, where early input cannot be discarded, so no answer is read
             import termios
 
-            # if the terminal is closed, reading raises the error
+            # ignore the error of a closed terminal, because reading the answer raises it
             with suppress(termios.error):
                 termios.tcflush(self._stdin.fileno(), termios.TCIFLUSH)
         while True:
@@ -158,7 +158,7 @@ class PlainOperator(_Keyless):
             try:
                 typed = read_answer(self.supervisor, question)
             except (KeyboardInterrupt, Declined):
-                # start a new line for the next message
+                # end the line of the prompt before the next message
                 self._write("\n")
                 raise
             if not self._stdin.isatty():
@@ -168,7 +168,7 @@ class PlainOperator(_Keyless):
             self._write(not_an_answer(question, typed) + "\n")
 
     def finish(self) -> None:
-        """Write the pending line of passed checks, which is waiting for further ones."""
+        """Write the line of passed checks that is still held back because further checks may join it."""
         self._write_lines(self._text.pending())
 
     def _write_lines(self, lines: Sequence[TextLine]) -> None:

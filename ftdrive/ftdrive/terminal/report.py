@@ -1,4 +1,4 @@
-"""Printed tables for results and verifications."""
+"""Results and verifications as tables and texts on the terminal."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ from ftdrivers.interfaces import Array
 
 _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
 _NO_LIMIT = 10_000
-# Rows whose values follow from the mass and the tilt.
+# Estimates that are printed only with --all, because they follow from the mass and the tilt.
 _DERIVED = {"gravity_force_base_N"}
 
 
@@ -40,10 +40,10 @@ def print_result(
     ----------
     result : CalibrationResult
     truth : mapping, optional
-        True values by the keys of the result; they and the errors are printed next to the estimates.
+        True values, with keys as in the JSON of a result; they and the errors are printed next to the estimates.
     drift : DriftCheck, optional
     records : sequence of PoseRecord
-        Records of the dataset, to name the poses and explain bad fits.
+        Records of the solved poses, to name the poses and to explain those that fit badly.
     hinted : bool
         Print hints about what to check in the cell.
     saved : Path, optional
@@ -73,7 +73,7 @@ def _result_table(result: CalibrationResult, truth: Mapping[str, Any] | None, *,
     table = Table(box=None, padding=(0, 1))
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
-            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # fold only the names
+            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may fold
     for key, axis, *texts in estimate_rows(data, truth):
         if key in _DERIVED and not every:
             continue
@@ -86,12 +86,12 @@ def _result_table(result: CalibrationResult, truth: Mapping[str, Any] | None, *,
 
 
 def _error_style(error_sigma: float) -> str:
-    """Return the colour of an error: 1 of 20 exceeds 2 sigma, 1 of 16,000 exceeds 4 sigma."""
+    """Return the colour of an error in sigmas: green below 2 (1 in 20 is larger), red from 4 (1 in 16,000)."""
     return "green" if abs(error_sigma) < 2 else "yellow" if abs(error_sigma) < 4 else "bold red"
 
 
 def print_comparison(compared: Sequence[MethodResult]) -> None:
-    """Print a comparison of all methods, without vectors on a narrow terminal; numbers are never cut."""
+    """Print a comparison of calibration methods; on a narrow terminal without vectors, so that no number is cut."""
     table = _comparison_table(compared, vectors=True)
     if answer.is_terminal and table.width is not None and table.width > answer.width:
         table = _comparison_table(compared, vectors=False)
@@ -102,10 +102,10 @@ def print_comparison(compared: Sequence[MethodResult]) -> None:
 
 
 def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], MethodResult]], heading: str) -> None:
-    """Print Yu's Table III: the largest errors on a test set, and the errors of the weight and the centre of mass.
+    """Print a table as Yu's Table III: the largest errors on a test set, and the errors of weight and centre of mass.
 
-    `titles` are the headings of the first columns: the method, or case, method and sets. `heading` names the test set
-    and the reference.
+    `titles` are the headings of the first columns: the method, or case, method and sets of poses. `heading` is printed
+    above the table; it names the test set and the reference.
     """
     answer.print(indented(" ", heading, answer))
     table = Table(box=None, padding=(0, 0, 0, 1), pad_edge=True)
@@ -122,7 +122,7 @@ def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], Metho
 
 
 def print_cases(cases: Sequence[tuple[int, str, str, MethodResult]], *, known: bool) -> None:
-    """Print Yu's Table III; `known` is true if an emulated cell gives the errors of weight and centre of mass."""
+    """Print the cases of Yu's Table III; `known` is true if weight and centre of mass are compared with the truth."""
     reference = "the truth of the emulated cell" if known else "ml with all poses but those of D"
     heading = f"Table III of Yu et al. 2021: largest errors on the test set; mg and centre against {reference}:"
     every = max((data for _, data, _, _ in cases), key=len)
@@ -161,7 +161,7 @@ def _comparison_table(compared: Sequence[MethodResult], *, vectors: bool) -> Tab
 
 
 def print_verification(verified: Verified) -> None:
-    """Print the measured and predicted wrench per pose, the verdict with its limits, the changes, and the file name."""
+    """Print a verification: measured and predicted wrench per pose, verdict with limits, changes, and the file name."""
     count = counted(len(verified.records), "pose")
     answer.print(Text.assemble(("Verification", "bold cyan"), f"  {count}, calibration {verified.calibration.id[:6]}"))
     for mark in verified.marks:

@@ -1,4 +1,4 @@
-"""The screen of a session: state, progress, estimates, coverage, keys."""
+"""The screen of a session in a terminal: state, progress, estimates, coverage, keys."""
 
 import os
 import sys
@@ -63,9 +63,9 @@ _NARROWEST_BAR = 8
 
 
 def draw_session(view: SessionView, now_s: float, *, width: int = 80, height: int = 24) -> Group:
-    """Return the screen, at most `width` wide and `height` high, with one line left for the cursor.
+    """Return the lines of a session's screen, at most `width` wide and `height` - 1 high, to leave one for the cursor.
 
-    If there is not enough room, blocks are omitted, those of the highest rank first. Blocks of rank 0 stay.
+    Each block of lines has a rank. If there is not enough room, the highest ranks are omitted; rank 0 always stays.
     """
     wide = width >= _TABLE_WIDTH + 1 + _CUBE_WIDTH
     blocks: list[tuple[int, list[Text]]] = [
@@ -175,7 +175,7 @@ def _estimate_text(fit: Estimated | None, label: str, factor: float, name: str) 
 
 
 def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
-    """Return the unfolded cube of the flange axes, with the number of poses in which gravity was along each."""
+    """Draw an unfolded cube whose faces are the flange axes, each with the number of poses with gravity along it."""
     face = None
     if newest is not None:
         axis = int(np.abs(newest).argmax())
@@ -207,10 +207,10 @@ def _keys(view: SessionView) -> list[Text]:
     end = "Ctrl-C ends; the poses are kept" if view.resume else "Ctrl-C ends"
     if view.keys != "live":
         return [Text(f"Enter sends the answer; {end}", "dim")] if view.keys == "asking" else []
-    # keys are only read between the first and the last pose
+    # list the keys only between the first and the last pose, because otherwise they are not read
     useful: set[Key] = set()
     if view.now is not None and view.now.stop is not None:
-        # in hand guiding, the number of poses is not fixed
+        # "finish" is only for hand guiding, where the number of poses is not fixed
         useful = set(KEYS) if view.now.stops is None else set(KEYS) - {Key.KEEP}
     line = Text()
     for key, word in KEYS.items():
@@ -239,15 +239,15 @@ def _folded(view: SessionView, text: str, width: int, style: str = "") -> list[T
 
 
 def _end_of(text: str, width: int) -> str:
-    """Shorten a path at its beginning, because runs differ at its end."""
+    """Shorten a text to `width` from its beginning, because the paths of runs differ at their end."""
     return text if len(text) <= width else "…" + text[len(text) - width + 1 :]
 
 
 class Screen:
-    """An operator at a terminal: messages scroll above a frame, and questions appear below it.
+    """An operator at a terminal. A frame shows the session; messages scroll above it, and questions appear below it.
 
-    Without a keyboard there are no keys, and whole lines answer the questions. With `verbose`, each check, the table of
-    the plan and each pose appear above the frame. `command` is the task, "calibrate" or "verify".
+    Questions are answered by lines. Without a `keyboard`, no keys are read during motion. With `verbose`, each check,
+    the table of the plan and each pose are printed above the frame. `command` is "calibrate" or "verify".
     """
 
     pressed_by = "the operator"
@@ -281,27 +281,27 @@ class Screen:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._view.keys = "over"
-        # nothing is drawn on a closed terminal
+        # ignore errors of drawing if the terminal is closed
         gone = suppress(OSError) if self.supervisor.absence() else nullcontext()
         with gone, self._stack:
             self._print(self._text.pending())
-            # after an error, keep the frame, because it contains the command to resume
+            # erase the frame, but keep it after an error, because it contains the command to resume
             self._live.transient = kind is None
             self._live.stop()
         if kind is None and self._view.folder:
-            # a sweep has no averages
+            # a sweep takes no poses, so there are no averages to count
             kept = f"{len(self._view.taken)} averages" if self._view.taken else "everything"
             self._print([TextLine(" ✔ ", f"{kept} kept in {self._view.folder}", "green")])
 
     def show(self, event: Event) -> None:
-        """Show an event."""
+        """Update the frame by an event, and print the event above it if it is part of the history."""
         with self._lock:
             self._view.update(event, self._clock())
         with self.supervisor.writing():
             self._print(self._text.lines(event) if _history(event, self._view) else self._text.pending())
 
     def ask(self, question: Question) -> str:
-        """Ask below the frame, which is redrawn after the answer."""
+        """Ask a question below the frame, which is redrawn after the answer."""
         self.supervisor.expect_answer()
         suspended = self._keyboard.suspended() if self._keyboard is not None else nullcontext()
         with self.supervisor.writing():
@@ -311,22 +311,22 @@ class Screen:
             with suspended:
                 answer = self._answer(question)
         self._view.keys = "live"
-        # the old display would erase the lines of its last frame
+        # a new display, because the old one would erase the lines of its last frame
         self._live = self._new_live()
         self._live.start(refresh=True)
         return answer
 
     def absence(self) -> str | None:
-        """Return why the session is no longer followed; see `Operator`."""
+        """Return why no operator follows the session any more, or None; see `Operator`."""
         return self.supervisor.absence()
 
     @property
     def has_keys(self) -> bool:
-        """Whether keys are read."""
+        """Whether single keys are read during motion."""
         return self._keyboard is not None
 
     def pressed(self) -> Key | None:
-        """Return the oldest unread key, or None."""
+        """Return the oldest key that was not returned yet; None if there is none."""
         return None if self._keyboard is None else self._keyboard.pressed()
 
     def _print(self, lines: Sequence[TextLine]) -> None:
@@ -338,7 +338,7 @@ class Screen:
         return Live(console=self._console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
 
     def _answer(self, question: Question) -> str:
-        """Ask until there is an answer, then erase the question and the frame to make room for the next frame."""
+        """Ask until an answer is valid, then erase question and frame, so that the next frame takes their place."""
         used = len(self._frame().renderables)
         while True:
             width = self._console.width
@@ -349,7 +349,7 @@ class Screen:
             try:
                 typed = read_answer(self.supervisor, question)
             except (KeyboardInterrupt, Declined):
-                # start a new line for the next message
+                # end the line of the prompt before the next message
                 self._console.file.write("\n")
                 raise
             used += len(lines) + (last.cell_len + 1 + cell_len(typed.rstrip("\n"))) // width + 1
@@ -382,9 +382,9 @@ def _history(event: Event, view: SessionView) -> bool:
 
 @contextmanager
 def open_operator(*, as_json: bool = False, command: str = "calibrate", live: bool = True) -> Iterator[Operator]:
-    """Yield the operator for a task: JSON on request, a live screen on a terminal, else plain lines.
+    """Yield the operator of a session: JSON on request, a live screen on a terminal, else plain lines.
 
-    The screen is drawn on stderr. A dumb terminal, `-q` and tasks without `live` get plain lines.
+    The screen is drawn on stderr. A dumb terminal, `-q` and `live=False` give plain lines.
     """
     if as_json:
         scripted = JsonOperator()

@@ -10,16 +10,16 @@ from typing import IO, Any, Final, Self, TextIO
 
 from ftdrive.errors import Declined, SupervisorGone
 
-# Period of the checks while waiting for an answer, ms.
+# While an answer is awaited, this is the period, ms, of the checks whether the operator is still there.
 _LOOK_MS: Final = 50
 
 
 class Supervisor:
-    """Watches the other ends of a session's streams. Only `read_line` reads, and never beyond its line.
+    """Watches whether the other ends of a session's streams still exist. Only `read_line` reads, and only one line.
 
     Inside a `with` block, a hang-up of the terminal (SIGHUP) is detected too, unless it is ignored, as with `nohup`.
-    The end of the input counts only if its writer was connected when a question was asked, because prepared answers may
-    end before. `name` is what messages call the output.
+    The end of the input counts only if its writer was connected when a question was asked, because a file or pipe with
+    prepared answers may end before. `name` is the name of the output in messages.
     """
 
     def __init__(self, stdin: TextIO, output: IO[str], name: str) -> None:
@@ -46,7 +46,7 @@ class Supervisor:
         self._hung_up = True
 
     def absence(self) -> str | None:
-        """Return why the session is no longer followed; see `Operator`."""
+        """Return why no operator follows the session any more, such as a closed terminal; None if one may follow it."""
         if self._hung_up or any(map(_is_closed, self._terminals)):
             return "the terminal was closed"
         if self._output is not None and _is_closed(self._output):
@@ -58,7 +58,7 @@ class Supervisor:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Raise `SupervisorGone` in place of an error in the block if the output has lost its reader."""
+        """If writing in the block fails because the reader of the output has ended, raise `SupervisorGone` instead."""
         try:
             yield
         except OSError as error:
@@ -72,13 +72,13 @@ class Supervisor:
             self._answers |= hasattr(select, "poll") and not _is_closed(self._input, reading=True)
 
     def read_line(self, unanswered: str) -> str:
-        """Read one line. Raises `SupervisorGone`, or at the end of the input `Declined` with the text `unanswered`."""
+        """Read a line. At the end of the input, raises `SupervisorGone` if `absence` gives a reason, or `Declined`."""
         fd = self._input
         if fd is None or not hasattr(select, "poll"):
             line = self._stdin.readline()
         else:
             self.expect_answer()
-            # Read byte by byte, so that nothing after the line is read and the end of the input is detected.
+            # byte by byte, so that nothing after the line is read and the end of the input is detected
             line = self._read_bytes(fd).decode(self._stdin.encoding or "utf-8", errors="replace")
         if not line:
             if why := self.absence():
@@ -87,7 +87,7 @@ class Supervisor:
         return line
 
     def _read_bytes(self, fd: int) -> bytes:
-        """Read byte by byte, as a shell does, so that the rest stays in the stream."""
+        """Read a line byte by byte, as a shell does, so that what follows stays in the stream."""
         poller, line = select.poll(), b""
         poller.register(fd, select.POLLIN)
         while not line.endswith(b"\n"):
@@ -99,7 +99,7 @@ class Supervisor:
             except OSError:
                 if fd not in self._terminals:
                     raise
-                byte = b""  # a closed terminal
+                byte = b""  # the terminal is closed
             if not byte:
                 break
             line += byte

@@ -14,17 +14,17 @@ import click
 
 from ftdrive.words.text import GLUE, as_typed, is_command, visible
 
-# Replaces hyphens in help texts, because click would break lines at them.
+# Stands for a hyphen while click folds a help text, because click would break lines at hyphens.
 _HYPHEN: Final = "\ue001"
-# A line width that no sentence exceeds.
+# Limit of a command's help line, longer than any sentence, so that click does not cut it.
 _WHOLE: Final = 1000
 _QUOTED = re.compile(r"`[^`\n]+`")
 
 
 def glue(text: str, width: int | None = None) -> str:
-    """Return text in which each command in backticks is one word, unless it is longer than `width` columns.
+    """Replace the spaces in each command in backticks, unless it is longer than `width`, so that it is one word.
 
-    Fold the text, then call `unglue` before printing it.
+    Lines are then not broken within commands. Call `unglue` after folding the text.
 
     Examples
     --------
@@ -37,7 +37,7 @@ def glue(text: str, width: int | None = None) -> str:
 
 
 def unglue(text: str) -> str:
-    """Return folded text with the spaces in its commands restored."""
+    """Return a text with the spaces restored that `glue` has replaced."""
     return text.replace(GLUE, " ")
 
 
@@ -49,7 +49,7 @@ class WholeWords(click.HelpFormatter):
         super().write_text(self._whole(text))
 
     def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
-        """Write options or commands with their descriptions."""
+        """Write a list of options or commands with their descriptions."""
         super().write_dl([(term, self._whole(words)) for term, words in rows], col_max, col_spacing)
 
     def getvalue(self) -> str:
@@ -72,14 +72,14 @@ class Group(click.Group):
 
 
 NARROWEST: Final = 20
-"""Smallest number of columns after a head for which lines are indented."""
+"""Lines are indented below the first word only if at least this number of columns is left for the text."""
 
 
 def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
-    """Return text with lines broken between words for a terminal, or with unchanged lines for a file or pipe.
+    """Fold a text between words if `file` is a terminal; for a file or pipe, its lines stay unchanged.
 
     Control characters become visible. Words longer than a line, such as paths, and commands in backticks stay whole. If
-    the text begins with `head`, the lines after the first are indented by its length.
+    the text begins with `head`, lines after the first are indented by the length of `head`.
     """
     text = visible(as_typed(text))
     try:
@@ -106,7 +106,7 @@ def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
 def echo(text: str = "", *, bold: str = "", err: bool = False, nl: bool = True, fold: bool = True) -> None:
     """Print text on stdout, or stderr with `err`, after the bold text `bold`.
 
-    On a terminal, lines break between words. Commands are printed as they must be typed. `fold=False` is for data.
+    On a terminal, lines break between words, and commands are printed as they must be typed; not with `fold=False`.
     """
 
     def shown(text: str) -> str:
@@ -120,9 +120,9 @@ GAP = "  "
 
 
 def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], folding: Collection[str]) -> None:
-    """Print a table; files, pipes and wide terminals get one line per row.
+    """Print a table with one line per row; on a narrow terminal, cells are folded and last columns moved below.
 
-    `folding` contains the titles of the columns that may be folded.
+    `folding` contains the titles of the columns whose cells may be folded.
     """
     rows = [[visible(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]

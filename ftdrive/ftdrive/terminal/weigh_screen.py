@@ -11,7 +11,7 @@ from ftdrive.terminal.lines import STRONG, Line
 from ftdrive.words.stream import NO_MASS, name_devices, worth_of, zero_in_words
 
 _FIGURES = "0123456789-"
-# Each digit has three rows and is three characters wide.
+# The digits and the minus sign in block characters: three rows, three characters wide.
 _ROWS = (
     "█▀█ ▀█  ▀▀█ ▀▀█ █ █ █▀▀ █▀▀ ▀▀█ █▀█ █▀█",
     "█ █  █  █▀▀ ▀▀█ ▀▀█ ▀▀█ █▀█   █ █▀█ ▀▀█ ▀▀▀",
@@ -20,9 +20,9 @@ _ROWS = (
 
 
 class WeighScreen(Canvas):
-    """Screen of a scale; an error from a device or in the recording ends it.
+    """Screen of `ftdrive weigh`; an error of a device or in the replayed recording ends it.
 
-    `turns` reads the stream, see `pump`; `address` is the address of the browser page, or empty.
+    Iterating `turns` reads the stream, see `pump`; `address` is that of the browser page, or empty.
     """
 
     def __init__(self, weighing: Weighing, turns: Iterable[object], address: str = "") -> None:
@@ -30,7 +30,7 @@ class WeighScreen(Canvas):
         self._weighing, self._turns = weighing, turns
 
     def draw(self, width: int, height: int) -> list[Line]:
-        """Draw the current state."""
+        """Return the lines that show the current mass, or why there is none."""
         info, shown = self._weighing.stream.info, self._weighing.shown
         mass, beside = NO_MASS, list[str]()
         if (weight := shown.measured) is not None:
@@ -49,7 +49,7 @@ class WeighScreen(Canvas):
         return [*lines, *[Line()] * (height - 1 - len(lines)), Line(f"  {keys}q quit")]
 
     def turns(self) -> Iterator[object]:
-        """Read and weigh."""
+        """Read the stream, which also weighs, until the screen is over."""
         return takewhile(lambda _: not self.is_over, self._turns)
 
     def act(self, key: str) -> None:
@@ -61,7 +61,7 @@ class WeighScreen(Canvas):
 
 
 def large_figures(text: str) -> list[str]:
-    """Return digits as three rows of block characters; other characters are put into the last row."""
+    """Return a text as three rows: digits in block characters, other characters in the last row."""
     rows = ["", "", ""]
     for one in text:
         at = 4 * _FIGURES.find(one)

@@ -25,11 +25,11 @@ from ftdrivers.errors import DeviceError
 from ftdrivers.ur.kinematics import model_named
 
 _ROWS: Final = {TOOL: ("Cylinder", "Cylinders"), WALLS: ("Wall", "Walls and tables"), BOXES: ("Box", "Boxes")}
-# Parts of the form: sections of the configuration, and questions whose answers have several rows.
+# Parts of the form in order: sections of the configuration, and questions with several answers, such as boxes.
 _PARTS: Final = ("robot", "sensor", "tool", TOOL, "workcell", WALLS, BOXES)
-# Largest number of rows of one kind, and of viewers' actions that are queued while a device is read.
+# Largest number of answers to one question, and of viewers' actions that are queued while a device is read.
 _MOST_ROWS, _MOST_USES = 30, 100
-# Entries of the drop-down lists for which a value must be typed.
+# Entry of each drop-down list after which a value must be typed.
 _TYPED: Final = {WALLS: "slanting", MODEL: "choose", "workcell.mounting": "degrees"}
 # Tool drawn on the arm until a tool is described.
 _NO_TOOL: Final = ((0.0, 5.0, 60.0),)
@@ -60,7 +60,7 @@ class _Field:
         return typed if self.choice in ("", _TYPED.get(self.key)) else chosen
 
     def controls(self) -> list[Part]:
-        """Return the controls: a selection, a text field, and a button that removes the row."""
+        """Return the controls of the field: a drop-down list or text field or both, and a button to remove it."""
         found, is_wall = [], self.key == WALLS
         if self.options:
             found += [choice(f"{self.name} choice", self.label + " at" * is_wall, self.choice, self.options)]
@@ -72,16 +72,16 @@ class _Field:
 
 
 class InitPage:
-    """Fills a page with the form, and a description with its answers; `draft` stores the answers after each change.
+    """Fills a page with the form of `ftdrive init`, and a description with the answers, stored in `draft` at changes.
 
-    `say` receives the report on a device, and a mark for the start of the line.
+    `say` receives what a device reports, and a mark for the start of the line.
     """
 
     def __init__(
         self, page: Page, described: Description, draft: Path, name: str, say: Callable[[str, str], object]
     ) -> None:
         self._page, self._described, self._draft, self._name, self._say = page, described, draft, name, say
-        # Only the thread that runs `run` changes anything: the server thread queues the viewers' actions here.
+        # viewers' actions from the server thread wait here, because only the thread of `run` changes the form
         self._todo: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._asked: dict[str, None] = {}
         self._fields: dict[str, _Field] = {}
@@ -98,21 +98,21 @@ class InitPage:
         self._read()
         self._saved = dict(described.texts)
 
-    # large numbers may overflow and are then judged invalid
+    # ignore overflow, because numbers that overflow are judged invalid
     @np.errstate(all="ignore")
     def run(self) -> None:
-        """Show and judge the answers until the file is to be written."""
+        """Show the answers and whether they are valid, until a viewer presses Write and all are."""
         while not self._refresh() or "write" not in self._asked:
             if "look" in self._asked:
                 self._look()
                 self._refresh()
             self._asked.clear()
-            # judge everything typed in the meantime at once
+            # take all actions that waited, so that their answers are judged at once
             for _ in range(max(1, self._todo.qsize())):
                 self._todo.get()()
 
     def conclude(self, *words: str) -> None:
-        """Show at the top and at the Write button that the file has been written."""
+        """Show at the top of the page and in place of the Write button that the file has been written."""
         written = lines(*words, head="Written", tone=GOOD)
         self._page.put({"result": written, "form/words": written, "form/write": None})
 
@@ -210,7 +210,7 @@ class InitPage:
     def _look(self) -> None:
         for field in [one for one in self._fields.values() if one.name in (ROBOT, SENSOR) and one.text]:
             self._page.put({"form/words": lines(f"Reading {field.text} …", tone=ASK)})
-            # Ctrl-C cannot interrupt a host name lookup, which may take 10 s, but it interrupts this wait.
+            # read in a thread, because Ctrl-C interrupts this wait, but not a host name lookup, which may take 10 s
             ended: SimpleQueue[Exception | None] = SimpleQueue()
             Thread(target=self._look_at, args=(field, ended.put), daemon=True).start()
             if (error := ended.get()) is not None:
@@ -219,7 +219,7 @@ class InitPage:
             self._say(words[2:], f"  {words[:2]}")
 
     def _look_at(self, field: _Field, end: Callable[[Exception | None], object]) -> None:
-        """Read one device, then call `end` with an unexpected error, or with None."""
+        """Read the device at the address in a field, then call `end` with an unexpected error, or with None."""
         failure = None
         try:
             self._found[field.name] = f"✔ {self._described.look(field.name, field.text)}", GOOD
@@ -232,7 +232,7 @@ class InitPage:
         end(failure)
 
     def _draw(self, wrong: Collection[_Field]) -> str:
-        """Draw the cell, with invalid and obstructing parts in red; describe what is closer to the arm than allowed."""
+        """Draw the cell, invalid and too close parts in red; return a text about what is too close to the arm."""
         rows = {key: [one for one in self._fields.values() if one.key == key and one.value] for key in _ROWS}
         tool, planes, boxes = (tuple(field.value for field in rows[key]) for key in _ROWS)
         workcell = WorkcellConfig(planes_mm=planes, boxes_mm=boxes)

@@ -26,9 +26,9 @@ from ftdrive.words.stream import NO_MASS, ShownWrench, StreamSummary, View, wort
 from ftdrivers.interfaces import Array
 from ftdrivers.ur.kinematics import forward
 
-# Plots are redrawn less often than the rest, by this factor. A plot is about 250 pixels wide, two pixels per column.
+# Plots are redrawn at every 5th drawing of the page. A plot is about 250 pixels wide, so its columns have 2 pixels.
 _PLOT_EACH, _COLUMNS, _EVENTS = 5, 128, 30
-# An arm that has moved less than this is not redrawn.
+# The arm is redrawn only if a joint has moved by more than this.
 _STILL_RAD = 1e-4
 _SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0, 10.0)
 _M_PER_N, _M_PER_NM = 0.01, 0.1
@@ -40,18 +40,18 @@ _LEGEND = (
 )
 _FOR_ALL = "Axes and point change for all viewers, in the terminal, and in printed and recorded data."
 _PLOTS = "blue: smallest to largest value, grey: ± 1 sigma of a free tool, orange: contact"
-# A wrench within the noise has no arrow; see `ShownWrench.is_significant`.
+# Colours of the contact state.
 _TONES = {words.CONTACT: parts.WARN, words.FREE: parts.GOOD}
 _ROWS = (("State", "", "large"), ("Force on the tool", "N", "huge"), ("Torque", "N·m", "large"))
-# Keeps the place of a line that may be empty, so that buttons do not move.
+# Shown in place of an empty line, so that the line keeps its height and buttons below it do not move.
 _BLANK = "\u00a0"
 
 
 class LivePage:
-    """Fills a page with the data of a `Feed`.
+    """Fills the page of `ftdrive live` with the stream of a `Feed`.
 
-    Without a `certifier`, only the axes of the base and the flange are drawn. With `controls`, viewers can tare, and
-    choose axes and reference point, which ends a contact and is recorded.
+    Without a `certifier`, which has the model of the arm, only the axes of base and flange are drawn. With `controls`,
+    viewers can tare, and choose axes and reference point, which ends a contact and is recorded.
     """
 
     def __init__(
@@ -75,11 +75,11 @@ class LivePage:
     def _set_frame(self, **change: Any) -> None:
         try:
             self._feed.stream.frame = replace(self._feed.stream.frame, **change)
-        except ConfigError as error:  # the page shows what to configure
+        except ConfigError as error:  # shown on the page
             raise ValueError(str(error)) from error
 
     def draw(self) -> None:
-        """Take new data, and show them if the page has viewers."""
+        """Take the new data of the stream, and show them if a browser shows the page."""
         view = self._summary.view()
         if not self._page.viewers:
             self._drawn = 0
@@ -142,14 +142,14 @@ def _static_scene(certifier: Certifier | None) -> dict[str, Part | None]:
 
 
 def _in_base(reading: ShownWrench, info: StreamInfo, p_base_flange_m: Array) -> tuple[Array, Array]:
-    """Return the reference point (3,) and the wrench (6,) in base axes."""
+    """Return the reference point (3,) of a shown wrench, and the wrench (6,), both in base axes."""
     R, frame = reading.R_base_flange, reading.frame
     R_flange_axes, p_flange_m = frames_in_flange(frame, info, R).get(frame.id, (np.eye(3), np.zeros(3)))
     return p_base_flange_m + R @ p_flange_m, (reading.wrench.reshape(2, 3) @ (R @ R_flange_axes).T).ravel()
 
 
 def texts(view: View, reading: ShownWrench | None) -> dict[str, Part | None]:
-    """Return parts with the silent device, the contact, force and torque with their description, and the events."""
+    """Return the page's texts: device without samples, contact state, force and torque, their meaning, events."""
     what, (state, _), info = words.WAITING, words.state(view), view.info
     rows = [parts.reading(name, "--", unit, note=_BLANK, size=size, tone=parts.BAD) for name, unit, size in _ROWS]
     if reading is not None:
@@ -185,7 +185,7 @@ def _size_line(view: View, reading: ShownWrench, first: int) -> Part:
 
 
 def plots(view: View, reading: ShownWrench) -> Part:
-    """Return a plot of each component, with its current value as the heading."""
+    """Return the plots of the six wrench components, each headed by the current value."""
     past, found, full = view.columns(_COLUMNS), list[Part](), dict[str, float]()
     low, high, sigma = (
         parts.rounded_list(past.low, 3),
@@ -201,7 +201,7 @@ def plots(view: View, reading: ShownWrench) -> Part:
 
 
 class WeighPage:
-    """Fills a page with a scale: the mass with its sigma, or the reason why there is none, and the age of the zero.
+    """Fills the page of `ftdrive weigh`: mass and sigma, or why there is no mass, and the age of the last zero.
 
     With `controls`, viewers can tare the empty gripper.
     """
@@ -213,7 +213,7 @@ class WeighPage:
             page.put({"controls": parts.controls(parts.button("zero", "Zero the empty gripper"))})
 
     def draw(self) -> None:
-        """Show mass, count and age of the zero, or why there is no mass, if the page has viewers."""
+        """Show mass (or why there is none), number of parts and age of the zero, if a browser shows the page."""
         if not self._page.viewers:
             return
         weighing, shown = self._weighing, self._weighing.shown

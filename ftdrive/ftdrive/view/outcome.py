@@ -19,7 +19,7 @@ from ftdrive.view.session_page import SessionPage, conclude
 from ftdrive.words.result import conclusion, verification_in_lines
 from ftdrive.words.text import in_one_line
 
-# Estimates shown on the page at the end.
+# Estimates that the page shows at the end of a calibration.
 _SHOWN: Final = {"mass_kg", "p_sensor_com_m", "R_flange_sensor"}
 
 
@@ -27,9 +27,9 @@ _SHOWN: Final = {"mass_kg", "p_sensor_com_m", "R_flange_sensor"}
 def on_page(
     page: Page | None, operator: Operator, options: SessionOptions, command: str = "calibrate"
 ) -> Iterator[tuple[Operator, SessionOptions]]:
-    """Show a session on the page, if there is one, while the block runs; yield the operator and the options to use.
+    """Show a session on a page while the block runs; yield the operator and options for the session.
 
-    If the block raises an error, the page shows the message that the terminal prints.
+    Without a page, these are the given ones. If the block raises an error, the page shows its message.
     """
     if page is None:
         yield operator, options
@@ -51,7 +51,7 @@ def _last_line(error: BaseException) -> str:
 
 
 def conclude_calibration(page: Page | None, result: CalibrationResult, commands: Sequence[str]) -> None:
-    """Show the verdict, estimates, findings and next commands on the page, if there is one."""
+    """Show verdict, estimates, findings and next commands of a calibration on its page; None is no page."""
     if page is None:
         return
     figures = []
@@ -66,7 +66,7 @@ def conclude_calibration(page: Page | None, result: CalibrationResult, commands:
 
 
 def conclude_verification(page: Page | None, verified: Verified, *following: str) -> None:
-    """Show the outcome, the largest differences and the next commands on the page, if there is one."""
+    """Show outcome, largest differences and next commands of a verification on its page; None is no page."""
     if page is None:
         return
     found, figures = verified.verification, []

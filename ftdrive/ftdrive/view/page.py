@@ -1,4 +1,4 @@
-"""A command's page: named parts that browsers show, controls that viewers use, and the loop that draws the page."""
+"""A command's browser page: named parts that are shown, controls that viewers use, and the loop that draws the page."""
 
 import json
 import logging
@@ -13,7 +13,7 @@ from ftdrive.view.parts import Part, button, controls
 
 log = logging.getLogger(__name__)
 
-# Even with the delays of a busy computer, this period gives 20 drawings per second.
+# Period of drawing, slightly shorter than 1/20 s, so that a busy computer still draws 20 times per second.
 _PERIOD_S: Final = 0.045
 # A drawing that takes longer than this, s, is considered hung.
 HUNG_S: Final = 5.0
@@ -21,15 +21,15 @@ _TEXT: Final = 10_000
 
 
 class Page:
-    """The content of a page, common to all browsers, and the actions that viewers may request."""
+    """The content of a browser page, the same for all viewers, and the actions that viewers may request."""
 
     def __init__(self, title: str) -> None:
         self.url = ""
-        """Address, including the required token."""
+        """Address of the page, with the token that the server requires."""
         self.viewers = 0
         """Number of browsers that are showing the page."""
         self._lock = threading.Lock()
-        # Each part with its JSON text and the page version in which it last changed.
+        # parts by name, each with its JSON text and the page version in which it last changed
         self._parts: dict[str, tuple[Part | None, str, int]] = {}
         self._version = 0
         self._acts: dict[str, Callable[[str, Any], object]] = {}
@@ -37,9 +37,9 @@ class Page:
         self.put({"title": {"kind": "title", "text": title}})
 
     def put(self, parts: Mapping[str, Part | None]) -> None:
-        """Show parts by name, all at once; None removes a part. Unchanged parts are not sent again.
+        """Show parts by name, all in one update; None removes a part. Unchanged parts are not sent again.
 
-        The name up to the first slash is that of a place in `page.html`, such as `state` or `scene`.
+        The name up to the first slash is that of an element of `page.html`, such as `state` or `scene`.
         """
         texts = {name: json.dumps(part, allow_nan=False, separators=(",", ":")) for name, part in parts.items()}
         with self._lock:
@@ -49,9 +49,9 @@ class Page:
                     self._parts[name] = parts[name], text, self._version
 
     def on(self, name: str, act: Callable[[str, Any], object]) -> None:
-        """Call `act` with the viewer and the valid value when a viewer uses the visible control of this name.
+        """From now on, call `act` with the viewer's name and the new value when a viewer uses the control `name`.
 
-        `act` is called in the server thread and must not wait; a `ValueError` from it is shown to the viewer.
+        `act` runs in the server thread and must not wait. The viewer sees the message of a `ValueError` from it.
         """
         self._acts[name] = act
 
@@ -61,7 +61,7 @@ class Page:
         self.on("stop", lambda viewer, _: stop(viewer))
 
     def act(self, viewer: str, name: object, value: object) -> None:
-        """Operate a control for a viewer. Raises `ValueError` if it is not visible or the value is invalid."""
+        """Use the control `name` for a viewer. Raises `ValueError` if it is not shown or the value is invalid."""
         with self._lock:
             shown = [part["controls"] for part, _, _ in self._parts.values() if part and part["kind"] == "controls"]
         found = next((one for part in shown for one in part if one["name"] == name and not one.get("disabled")), None)
@@ -70,22 +70,22 @@ class Page:
         self._acts[found["name"]](viewer, _valid_value(found, value))
 
     def since(self, version: int) -> tuple[int, str]:
-        """Return the current version, and the parts newer than `version` as JSON; empty if there are none."""
+        """Return the page's current version, and as JSON the parts that changed after `version`; "" for no change."""
         with self._lock:
             newer = [f"{json.dumps(name)}:{text}" for name, (_, text, at) in self._parts.items() if at > version]
             return self._version, f"{{{','.join(newer)}}}" if newer else ""
 
     def beat(self) -> None:
-        """Mark the page as drawn now; from now on, it becomes stale unless it is drawn again."""
+        """Mark the page as drawn now. From now on, it counts as stale after a while without the next `beat`."""
         self._drawn_s = monotonic()
 
     def rest(self) -> None:
-        """Mark the page as drawn only on events, as before the first `beat`."""
+        """Mark the page as drawn only at changes, as it is before the first `beat`, so that it never becomes stale."""
         self._drawn_s = None
 
     @property
     def stale_s(self) -> float:
-        """Time since the page was last drawn, s; 0 for a page that is drawn only on events."""
+        """Time since the last `beat`, s; 0 for a page that is drawn only at changes."""
         return 0.0 if self._drawn_s is None else monotonic() - self._drawn_s
 
 
@@ -107,18 +107,18 @@ def _valid_value(control: Part, value: object) -> object:
 
 @contextmanager
 def drawing(page: Page, draw: Callable[[], None], say: Callable[[str], object] = log.error) -> Iterator[None]:
-    """Call `draw` 22 times per second in a thread while the block runs; `say` receives an error that ends the calls."""
+    """Draw the page 22 times per second in a thread while the block runs. An error ends the drawing; `say` gets it."""
     ended = threading.Event()
 
     def run() -> None:
         due_s = monotonic()
         try:
-            # drawings missed while the computer was paused are not made up for
+            # drawings that were missed while the computer was paused are skipped
             while not ended.wait(max(0.0, due_s - monotonic())):
                 due_s = max(due_s + _PERIOD_S, monotonic())
                 draw()
                 page.beat()
-        except Exception as error:  # only a display: the stream continues
+        except Exception as error:  # the command goes on without its page
             log.debug("the drawing has failed", exc_info=True)
             say(f"The page is no longer updated, the command continues: {error!r}")
             ended.set()

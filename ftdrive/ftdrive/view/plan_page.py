@@ -1,4 +1,4 @@
-"""The page of a plan: the motion along the tour, the swept volume, and the largest move."""
+"""The browser page of a plan: the motion along the tour, the swept volume, and the largest move."""
 
 import threading
 from time import monotonic
@@ -21,16 +21,16 @@ PLAN_LEGEND: Final = (
     *((scene.ARM, "body", "arm"), (scene.TOOL, "body", "tool"), (scene.PATH, "line", "path of the tool tip")),
     *((scene.GHOST, "ball", "ball to keep free"), (scene.OBSTACLE, "body", "surroundings")),
 )
-"""Legend for `plan_parts` and an arm."""
+"""Rows of the legend for what `plan_parts` draws, and for the arm."""
 
 
 class PlanTimeline:
-    """A plan as joint angles over time, after the approach `way_rad` (k + 1, 6) to its first pose, if any."""
+    """The joint angles of a plan over time, preceded by the approach `way_rad` (k + 1, 6), if there is one."""
 
     def __init__(self, plan: Plan, way_rad: ArrayLike = ()) -> None:
         self.plan, way, tour = plan, np.reshape(way_rad, (-1, 6)), [step.q_rad for step in plan.steps]
         slow, turns_rad = Speeds.first_run(), np.abs(np.diff(way, axis=0)).max(axis=1)
-        # The last segment of the approach has no duration: for a resumed run it ends at a pose other than the first.
+        # From the end of the approach to the first pose, no time passes: a resumed run may approach another pose.
         approach_s = [*move_duration_s(turns_rad, slow.joint_rad_s, slow.joint_rad_s2), *([0.0] if len(way) else [])]
         self._nodes_rad = np.array([*way, *tour, tour[0]])
         self._t_s = np.cumsum([0.0, *approach_s, *(step.duration_s for step in plan.steps)])
@@ -38,13 +38,13 @@ class PlanTimeline:
         self.q_rad = self.at(np.union1d(self._t_s, np.arange(0, self.end_s, 0.1)))
 
     def at(self, t_s: ArrayLike) -> Array:
-        """Return the joint angles (..., 6) at times (...)."""
+        """Return the joint angles (..., 6), rad, at times (...), s."""
         return np.stack(
             [np.interp(np.asarray(t_s, dtype=np.float64), self._t_s, joint) for joint in self._nodes_rad.T], axis=-1
         )
 
     def move(self, t_s: float) -> int:
-        """Return the index of the move at a time; -1 during the approach."""
+        """Return the index of the plan's move at a time, s; -1 during the approach."""
         return int(np.searchsorted(self.begins_s, t_s, side="right")) - 1
 
     def slider(self, t_s: float) -> Part:
@@ -55,7 +55,7 @@ class PlanTimeline:
 
 
 class PlanPage:
-    """Fills a page with a plan; `certifier` belongs to the same arm, tool and scene."""
+    """Fills a page with a plan and its animation; `certifier` must belong to the same arm, tool and scene."""
 
     def __init__(self, page: Page, plan: Plan, certifier: Certifier) -> None:
         self._page, self._plan, self._arm, self._tour = page, plan, certifier.arm, PlanTimeline(plan)
@@ -82,7 +82,7 @@ class PlanPage:
                 self._chosen[name] = not self._chosen["play"] if name == "play" else value
 
     def draw(self) -> None:
-        """Send the changes to the browsers."""
+        """Draw the page if a viewer has changed something or the arm has moved."""
         with self._lock:
             chosen = dict(self._chosen)
         if chosen == self._drawn:
@@ -104,7 +104,7 @@ class PlanPage:
         self._page.put({**scene.arm_parts(self._arm, self._tour.at(t_s)), **volumes, **parts})
 
     def play(self, ended: threading.Event) -> None:
-        """Draw what viewers choose, and the arm moving along the tour, until `ended` is set."""
+        """Animate the arm along the tour and draw what viewers choose, until `ended` is set."""
         then_s = monotonic()
         while not ended.wait(_FRAME_S):
             passed_s, then_s = monotonic() - then_s, monotonic()
@@ -116,7 +116,7 @@ class PlanPage:
 
 
 def plan_parts(certifier: Certifier, tour: PlanTimeline) -> dict[str, Part | None]:
-    """Return the cell, the ball to keep free, the path of the tool tip, and the camera."""
+    """Return parts that draw the surroundings, the ball to keep free and the tool tip's path, and the camera."""
     arm, size_m, plan = certifier.arm, scene.size_of(certifier), tour.plan
     farthest = int(np.argmax([part.to_m for part in arm.tool]))
     look_at = 0.7 * arm.frames(tour.q_rad[:1]).wrist_m[0]

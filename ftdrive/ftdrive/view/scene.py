@@ -12,7 +12,7 @@ from ftdrive.planning.geometry.scene import Scene
 from ftdrive.view.parts import Part, rounded_list
 from ftdrivers.ur.kinematics import Array
 
-# Names of colours, which `shell/page.css` defines for light and dark mode.
+# Names of the colours in the scene; `shell/page.css` defines each for light and dark mode.
 ARM, TOOL, GHOST, OBSTACLE, BAD = "arm", "tool", "ghost", "obstacle", "bad"
 FORCE, TORQUE, PATH, UNKNOWN = "force", "torque", "path", "unknown"
 
@@ -46,17 +46,17 @@ def path(points_m: Array, colour: str) -> Part:
 
 
 def dots(points_m: ArrayLike, colours: Sequence[str], at: ArrayLike) -> Part:
-    """Return round dots at points (n, 3) relative to `at`, of the same size on every screen."""
+    """Return round dots at points (n, 3) relative to `at`; their size on the screen does not depend on the zoom."""
     return {"kind": "dots", "points": rounded_list(points_m), "colours": list(colours), "at": rounded_list(at)}
 
 
 def axes(length_m: float, at: ArrayLike = (0, 0, 0), turn: ArrayLike = (1, 0, 0, 0), *, named: bool = False) -> Part:
-    """Return the axes x, y, z in red, green and blue, with their names on request."""
+    """Return coordinate axes x, y, z in red, green and blue, with their names if `named`."""
     return {"kind": "axes", "length": length_m, "at": rounded_list(at), "turn": rounded_list(turn), "named": named}
 
 
 def label(text: str, at: ArrayLike) -> Part:
-    """Return a text at a point (3,), always in front."""
+    """Return a text at a point (3,), which no body hides."""
     return {"kind": "label", "text": text, "at": rounded_list(at)}
 
 
@@ -79,10 +79,10 @@ def arm_parts(
     clear: bool = False,
     bad: Collection[str] = (),
 ) -> dict[str, Part | None]:
-    """Return an arm with its tool at joint angles (6,); without angles, the parts that remove the arm.
+    """Return parts that draw an arm with its tool at joint angles (6,), or that remove the arm if `q_rad` is None.
 
     A `ghost` is transparent and shows where the arm will be. With `clear`, the tool is transparent, so that a wrench
-    inside it is visible. Bodies named in `bad` are red.
+    drawn inside it is visible. Bodies named in `bad` are red.
     """
     names = [f"scene/{name}/{i}" for i in range(len(arm.names))]
     if q_rad is None:
@@ -97,7 +97,7 @@ def arm_parts(
         shape = bodies.half_length_m[i], bodies.radius_m[i], bodies.rounding_m[i]
         parts[key] = body(*shape, colour, at=bodies.centre_m[0, i], turn=turns[i], alpha=alpha)
     if not ghost:
-        # The view "along the tool" looks from the last body towards the flange.
+        # point and axis for the button "along the tool", with which the camera looks from the last body to the flange
         parts[f"scene/{name}/along"] = {
             "kind": "along",
             "at": rounded_list(bodies.centre_m[0, -1]),
@@ -107,12 +107,12 @@ def arm_parts(
 
 
 def carried_bodies(arm: ArmModel) -> range:
-    """Return the indices of the bodies beyond the flange: the tool, and a load that hangs from it."""
+    """Return the indices of an arm model's bodies beyond the flange: the tool, and a load that hangs from it."""
     return range(arm.names.index("tool 1"), len(arm.names))
 
 
 def surroundings(scene: Scene, size_m: float, bad: Collection[str] = ()) -> dict[str, Part | None]:
-    """Return base axes, planes as `size_m` squares, and boxes; those named in `bad`, such as "plane 2", are red."""
+    """Return parts that draw base axes, planes as squares, and boxes; those named in `bad`, as "plane 2", are red."""
     parts: dict[str, Part | None] = {"scene/base": axes(0.25, named=True)}
     for i, plane in enumerate(scene.planes, start=1):
         colour = BAD if f"plane {i}" in bad else OBSTACLE
@@ -126,7 +126,7 @@ def surroundings(scene: Scene, size_m: float, bad: Collection[str] = ()) -> dict
 
 
 def wrench_parts(p_base_m: Array, wrench_base: Array, m_per_N: float, m_per_Nm: float) -> dict[str, Part | None]:
-    """Return force and torque as arrows, and the line of action of the force.
+    """Return parts that draw force and torque as arrows, and the line of action of the force.
 
     The wrench (6,), N and N·m, acts about a point (3,), base axes; a zero force or torque is not drawn.
     """
@@ -137,18 +137,18 @@ def wrench_parts(p_base_m: Array, wrench_base: Array, m_per_N: float, m_per_Nm: 
             parts[f"scene/{name}"] = {"kind": "arrow", "ends": ends, "colour": name}
     force, torque = wrench_base[:3], wrench_base[3:]
     if squared := float(force @ force):
-        # Along this line, the force alone explains as much of the torque as possible.
+        # On this line, the force alone explains as much of the torque as possible.
         foot, along = p_base_m + np.cross(force, torque) / squared, 0.5 * force / np.sqrt(squared)
         parts["scene/line of action"] = path(np.array([foot - along, foot + along]), FORCE)
     return parts
 
 
 NO_WRENCH: Final[dict[str, Part | None]] = {"scene/force": None, "scene/torque": None, "scene/line of action": None}
-"""Parts that remove the arrows of a wrench."""
+"""Parts that remove the arrows and the line of action drawn by `wrench_parts`."""
 
 
 def size_of(certifier: Certifier) -> float:
-    """Return twice the reach of the arm, m, which is the size of the drawn planes."""
+    """Return twice the reach of the arm, m: the size of the drawn scene and of its planes."""
     arm = certifier.arm
     return 2 * (arm.ball_m + float(np.linalg.norm(arm.kinematics.links_m[1:3], axis=1).sum()))
 

@@ -1,4 +1,4 @@
-"""The page of a session: state, question, forces and estimates next to the scene, a Stop button, the final result."""
+"""The browser page of a session: state, question, forces, estimates, the drawn arm, a Stop button, the result."""
 
 import logging
 import threading
@@ -38,32 +38,32 @@ log = logging.getLogger(__name__)
 Parts = dict[str, Part | None]
 
 _FRAME_S: Final = 0.05
-# Guards that have checked nothing for this time are inactive, s.
+# Guards that have not checked an observation for this time, s, are shown as inactive.
 _REST_S: Final = 0.5
 # A bar above this share of its limit has the colour of a warning.
 _NEAR: Final = 0.8
-# Colours of poses, each with the largest residual, in sigmas, for which it is used.
+# Colours of poses by their residual: for each colour, the largest residual in sigmas, and its text in the legend.
 _COLOURS: Final = ((3.0, GOOD, "residual ≤ 3 sigma"), (5.0, WARN, "≤ 5 sigma"), (np.inf, BAD, "> 5 sigma"))
 _POSES: Final = [
     (name, "ball", f"pose, {words}") for _, name, words in (*_COLOURS, (0, scene.UNKNOWN, "no residual yet"))
 ]
 _SPHERE_M: Final = 0.18
-# In a hand-guided session, the scene has no arm.
+# Camera and legend of a hand-guided session, in which no arm is drawn.
 _ALONE: Final[Parts] = {"scene/camera": scene.camera([0, 0, 0], [0.5, 0.5, 0.3]), "scene/legend": scene.legend(*_POSES)}
-# States in which the arm has not reached its stop yet.
+# States of a session in which the arm has not reached the pose of its stop yet.
 _TOWARDS: Final = frozenset({State.APPROACH, State.MOVE})
-# Parts that are valid only while the session runs, and are removed at its end.
+# Parts of the page that apply only to a running session, and are removed at its end.
 _LIVE: Final = ("stop", "alert", "question", "question/along", "state/progress", "state/note", "bars", "bars/guards")
 _ENDED: Final[Parts] = {**dict.fromkeys(_LIVE), "state": lines(head="ended")}
 
 
 class Onlooker(Guard):
-    """A guard that stores the latest observation and never trips."""
+    """A guard that never trips: it stores the latest observation of the arm, so that a page can draw it."""
 
     def __init__(self) -> None:
         self.seen: Seen | None = None
         self.fresh_s = self.age_s = self.looked_s = 0.0
-        """Arrival and age of the newest sample, and the last call of `look` on the computer's clock, s."""
+        """When the newest sample arrived; its age at the last `look`; when that was, on the computer's clock; s."""
 
     def look(self, seen: Seen) -> None:
         """Store the observation."""
@@ -73,10 +73,10 @@ class Onlooker(Guard):
 
 
 class SessionPage:
-    """An operator that shows another operator's session on a page, where any viewer can stop it.
+    """An operator that passes everything to another one and shows the session on a page, where viewers can stop it.
 
-    The other operator answers the questions. A thread draws the current state while the page is open in a browser, so
-    that browsers do not delay the session. If drawing fails or hangs, the session continues and `pressed` reports it.
+    The other operator answers the questions. While a browser shows the page, a thread draws the current state, so that
+    browsers do not delay the session. If drawing fails or hangs, the session continues and `pressed` reports it.
     """
 
     def __init__(self, page: Page, operator: Operator, command: str) -> None:
@@ -86,8 +86,8 @@ class SessionPage:
         self._question: Question | None = None
         self._stopped_by = self._note = self._failure = ""
         self._is_reported = False
-        self._stop = 1  # the last stop, stored because a hold has none
-        # Largest residual at each stop, in sigmas.
+        self._stop = 1  # the last stop; a hold names none
+        # largest residual in sigmas of the pose at each stop; None if unknown
         self._residuals: dict[int, float | None] = {}
         self._plan: events.Planned | None = None
         self._cell: tuple[Certifier, RangeGuard] | None = None
@@ -114,12 +114,12 @@ class SessionPage:
         self._stopped_by = self._stopped_by or viewer
 
     def watch(self, certifier: Certifier, load: RangeGuard) -> Onlooker:
-        """Draw this cell from now on, as the returned guard observes it. See `SessionOptions.watch`."""
+        """Return a guard through which the page observes and draws this cell. See `SessionOptions.watch`."""
         self._cell = certifier, load
         return self._onlooker
 
     def show(self, event: Event) -> None:
-        """Store what the page draws, and pass the event to the other operator."""
+        """Store what the page needs of an event, and pass the event to the other operator."""
         with self._lock:
             self._view.update(event, time.monotonic())
             match event:
@@ -140,7 +140,7 @@ class SessionPage:
         self._operator.show(event)
 
     def ask(self, question: Question) -> str:
-        """Ask in the terminal. Also raises `Declined` if a viewer has stopped the session."""
+        """Let the other operator answer, and show the question. Raises `Declined` too if a viewer stops the session."""
         self._report_failure()
         self._require_unstopped()
         self._question, self._view.keys = question, "asking"
@@ -167,12 +167,12 @@ class SessionPage:
 
     @property
     def pressed_by(self) -> str:
-        """Name of the viewer or operator who pressed the key."""
+        """Name of the viewer or operator who pressed the key that `pressed` returned."""
         return self._stopped_by or self._operator.pressed_by
 
     @property
     def kept(self) -> Sequence[str]:
-        """Lines of the last note if there is a run; after an early end, they say what is stored and how to continue."""
+        """Lines of the closing message: after an early end, what is stored and how to continue. Empty without a run."""
         return self._note.split("\n") if self._view.folder else ()
 
     def _require_unstopped(self) -> None:
@@ -184,7 +184,7 @@ class SessionPage:
         if (why := self._failure or hung) and not self._is_reported:
             self._is_reported = True
             words = f"The page cannot be updated: {why}. The session continues. Stop on the page still works."
-            with suppress(SupervisorGone):  # reported by a guard
+            with suppress(SupervisorGone):  # a guard reports it too
                 self._operator.show(events.Noted(words=words, warning=True))
 
     def _look_at(self, _: str, t_s: float) -> None:
@@ -199,12 +199,12 @@ class SessionPage:
                 if self._page.viewers or ended:
                     self.draw()
                 self._page.beat()
-        except Exception as error:  # only a display: the session continues
+        except Exception as error:  # the session goes on without its page
             self._failure = repr(error)
             log.debug("the page cannot be drawn", exc_info=True)
 
     def draw(self) -> None:
-        """Send the current state to browsers."""
+        """Draw the current state of the session on the page."""
         with self._lock:
             view = replace(self._view, taken=dict(self._view.taken), compared=dict(self._view.compared))
             residuals, note = dict(self._residuals), self._note
@@ -219,11 +219,11 @@ class SessionPage:
             parts |= self._forces(seen, self._cell[1])
         downs = [(pose.gravity_flange, residuals.get(stop)) for stop, (pose, _) in view.taken.items()]
         parts |= _gravity_sphere(downs, None if self._scene is None else self._scene.sphere_m)
-        # a hung drawing may continue after the end
+        # if the session has ended, remove its parts again, because a hung drawing may continue after the end
         self._page.put(parts | (_ENDED if self._ended.is_set() else {}))
 
     def _forces(self, seen: Seen, load: RangeGuard) -> Parts:
-        """Return force and torque with the limits of their guard, and the joint speed and the age of the sample."""
+        """Return parts with force and torque and the limits of their guard, the joint speed, and the sample's age."""
         if time.monotonic() - self._onlooker.looked_s > _REST_S:
             rest = "The guards are inactive: the arm is drawn at their last observation."
             return {"bars": lines(rest, tone=QUIET), "bars/guards": None}
@@ -247,10 +247,10 @@ class _Cell:
         self._tour, self._arm = PlanTimeline(planned.plan, planned.way_rad), certifier.arm
         self._asked: Question | None = None
         self.chosen_s = 0.0
-        """Position along the plan shown during a question."""
+        """Time along the plan, s, that is drawn during a question, as chosen by viewers."""
         wrist_m, size_m = self._arm.frames(self._tour.q_rad[:1]).wrist_m[0], scene.size_of(certifier)
         self.sphere_m = wrist_m + np.array([0.0, 0.0, 0.25 * size_m])
-        # This view shows both the arm and the sphere.
+        # the camera shows both the arm and the sphere of gravity directions above it
         look_at = 0.65 * self.sphere_m
         camera = scene.camera(look_at, look_at + 0.7 * size_m * np.array([1.0, 1.0, 0.4]))
         rows = *PLAN_LEGEND, (scene.GHOST, "body", "next pose"), *_POSES
@@ -259,7 +259,7 @@ class _Cell:
     def parts(
         self, now: events.StateChanged | None, stop: int, seen: Seen | None, question: Question | None, *, ended: bool
     ) -> Parts:
-        """Return the arm as last observed, its goal, and during a question the slider along the plan."""
+        """Return parts with the arm as last observed, its goal, and, during a question, the slider along the plan."""
         nodes, goal_rad, along = self._tour.plan.nodes_rad, None, None
         if question is not None:
             if question is not self._asked:
@@ -280,7 +280,7 @@ class _Cell:
 
 
 def question_part(question: Question | None) -> Part | None:
-    """Return the question that waits for its answer in the terminal."""
+    """Return a part with the question that waits for its answer in the terminal; None without a question."""
     return None if question is None else lines(question.text, head="Answer in the terminal", tone=ASK)
 
 
@@ -336,7 +336,7 @@ def _gravity_sphere(downs: Sequence[tuple[Array, float | None]], above_m: Array 
 def conclude(
     page: Page, head: str, *words: str, tone: str = "", figures: Sequence[Part] = (), following: Sequence[str] = ()
 ) -> None:
-    """Show how a session ended; `reading` makes the `figures`, and `following` are the next commands."""
+    """Show on a page how a session ended; `figures` are made by `reading`, `following` are commands to type next."""
     page.put(
         {
             "result": lines(head=head, tone=tone),

@@ -26,19 +26,19 @@ from ftdrive.servers.http_gate import Address, Gate, Request, is_loopback, with_
 from ftdrive.view.page import Page
 from ftdrivers.installation import missing_extra
 
-# By default, only this computer can open the page.
+# Default address, at which only this computer can open the page.
 _LOCAL: Final[Address] = ("127.0.0.1", 8080)
-# Even with the delays of a busy computer, this period gives 20 updates per second.
+# Period of updates, slightly shorter than 1/20 s, so that a busy computer still sends 20 per second.
 _PERIOD_S: Final = 0.045
-# Heartbeat period, s. A browser that misses several heartbeats shows the page as stale.
+# Period of the heartbeats, s. A browser that receives none for a few periods shows the page as stale.
 _BEAT_S: Final = 1.0
-# A viewer with a non-empty buffer is sent no more data, and is disconnected after this time, s.
+# A browser that does not read, so that its send buffer stays filled, gets no data and is disconnected after this, s.
 _SUSPENDED_S: Final = 30.0
 _VIEWERS: Final = 300
-# Largest body of a request, bytes, and the time-out for its body, s.
+# Largest body of a request, bytes, and the time-out for receiving it, s.
 _BODY_BYTES: Final = 1 << 15
 _BODY_S: Final = 5.0
-# Policy: nothing from other sites, no inline scripts, no embedding in other pages. uPlot sets inline styles.
+# Headers with a security policy: nothing from other sites, no inline scripts (but styles, for uPlot), no embedding.
 _SAFE: Final = (
     "Content-Security-Policy: default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
     "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -53,24 +53,24 @@ _log = logging.getLogger(__name__)
 
 
 class Site(Gate):
-    """Serves a page to browsers that have opened its address with the token, which they keep as a cookie.
+    """Serves a page to browsers that have opened its address with the token, which they then keep as a cookie.
 
-    With port 0, the system chooses one; see `port`. Raises `ConfigError` if the extra `viz` is not installed, and
-    `OSError` for an address that cannot be used.
+    With port 0, the system chooses a port, see `port`. Raises `ConfigError` if the extra `viz` is not installed, and
+    `OSError` if the address cannot be used.
     """
 
     def __init__(self, page: Page, bound: Address) -> None:
         _files()  # raise for a missing file before the port is opened
         self.token = secrets.token_urlsafe(18)
         self._page = page
-        # For each viewer, the page version that it has, and the time at which its buffer was last empty.
+        # for each viewer's connection, the page version that was sent, and when its send buffer was last empty
         self._viewers: dict[asyncio.StreamWriter, tuple[int, float]] = {}
         self._opened = 0
         super().__init__(bound)
         asyncio.run_coroutine_threadsafe(self._send_all(), self.loop)
 
     async def serve(self, request: Request) -> None:
-        """Answer a request, which must come from the page's own origin."""
+        """Answer an HTTP request; requests without the token or from other pages are refused."""
         path, _, query = request.target.partition("?")
         number = self._viewer_of(request.headers.get("Cookie", ""))
         if path == "/" and request.method == "GET" and query.startswith("token="):
@@ -91,7 +91,7 @@ class Site(Gate):
             await request.refuse(HTTPStatus.NOT_FOUND, "this page does not exist")
 
     def end(self) -> None:
-        """Send browsers the last state, which they keep showing, and the notice that the program has ended."""
+        """Send browsers the last state of the page, which they keep showing, and that the program has ended."""
         with suppress(TimeoutError):
             asyncio.run_coroutine_threadsafe(self._end_viewers(), self.loop).result(1.0)
 
@@ -115,7 +115,7 @@ class Site(Gate):
         return None
 
     async def _act(self, request: Request, viewer: str) -> None:
-        """Pass a control's request to the page; other sites cannot send its type without a preflight request."""
+        """Pass a viewer's use of a control to the page; only JSON, which other sites cannot send without permission."""
         headers = request.headers
         length = headers.get("Content-Length", "")
         if headers.get("Origin") is None or headers.get("Content-Type") != "application/json":
@@ -138,7 +138,7 @@ class Site(Gate):
                     await request.answer(HTTPStatus.NO_CONTENT)
 
     async def _follow(self, request: Request, number: int) -> None:
-        """Start server-sent events for a viewer, until the browser disconnects; bytes from it are ignored."""
+        """Register a browser for server-sent events until it disconnects; bytes that it sends are ignored."""
         if len(self._viewers) >= _VIEWERS:
             await request.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{_VIEWERS} viewers at most")
             return
@@ -155,7 +155,7 @@ class Site(Gate):
             self._page.viewers = len(self._viewers)
 
     async def _send_all(self) -> None:
-        """Send each viewer the changes since its version; a viewer that does not read gets the latest state later."""
+        """Send each viewer the changes since its version, forever; one that does not read now gets them all later."""
         beat_s = 0.0
         while True:
             await asyncio.sleep(_PERIOD_S)
@@ -215,7 +215,7 @@ def _reached_at(host: str) -> str:
     if host not in ("0.0.0.0", "::"):
         return host
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
-        # Nothing is sent: an address reserved for documentation only selects the interface.
+        # connecting UDP sends nothing, but selects the network interface; this address is reserved for documentation
         probe.connect(("192.0.2.1", 9))
         return str(probe.getsockname()[0])
     return socket.gethostname()
@@ -223,13 +223,13 @@ def _reached_at(host: str) -> str:
 
 @contextmanager
 def announce_page(page: Page, address: Address | None, print_page: Callable[..., object]) -> Iterator[None]:
-    """Print a page's address, with a QR code for other devices if it is shared; else open it if there is a screen."""
+    """Print a page's address. If other devices can open it, add a QR code; else open it in a browser, if any."""
     shared = address is not None and not is_loopback(address[0])
     print_page(page.url, shared=shared)
     if shared or (sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))):
         yield
         return
-    # An address given to the browser as an argument would be visible in `ps`. Only the owner can enter the folder.
+    # open a file in a private folder that redirects to the page, because `ps` would show an address as an argument
     with TemporaryDirectory(prefix="ftdrive-", ignore_cleanup_errors=True) as folder:
         file = Path(folder, "page.html")
         file.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={escape(page.url)}">')
@@ -239,7 +239,7 @@ def announce_page(page: Page, address: Address | None, print_page: Callable[...,
 
 @cache
 def _files() -> dict[str, Path]:
-    """Return a page's files by their address: the shell, and those of the package uPlot, which is not imported."""
+    """Return the files that a page needs by their address: those in `shell`, and those of the package uPlot."""
     shell = Path(__file__).parent / "shell"
     files: dict[str, Path] = {f"/{file.name}": file for file in shell.iterdir() if file.suffix in _TYPES}
     files["/"] = files.pop("/page.html")
