@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
-# Properties of a calibration: a tilted base, a rotated sensor, gain and cross-talk of the sensor.
+# What not every target can express: a tilt of the base, a rotation of the sensor, its gain and cross-talk.
 Property = Literal["tilt", "rotation", "response"]
 Comment = Literal["#", "# at the end", "<!-- -->", "none"]
 
-# Largest force error, N, accepted from an export format that cannot represent the whole calibration.
+# Default of the largest force error, N, that is accepted if a format cannot represent the whole calibration.
 MAX_FORCE_ERROR_N: Final = 0.1
-# Gravity in mc_rtc/constants.h. The force must be right, so the exported mass differs by up to 0.3 %.
+# Gravity in mc_rtc/constants.h. Mass times this value must be the right weight, so the exported mass is adjusted.
 MC_RTC_G_M_S2: Final = 9.80665
 
 _SPELLED: Final = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"})
@@ -26,17 +26,17 @@ def plain_ascii(text: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ExportFormat:
-    """Format of one target program."""
+    """Format in which a calibration is exported for one target, a program."""
 
     description: str
     file: str
-    """Usual name of the file."""
+    """Usual name of the file that the target reads."""
     subtracts: tuple[Literal["bias", "weight"], ...] = ("bias", "weight")
-    """What the target subtracts from the reading."""
+    """What the target subtracts from the sensor's reading with the exported values."""
     expresses: tuple[Property, ...] = ("tilt", "rotation")
     """Properties of the calibration that the target can express; for "response", see `has_own_reading`."""
     comment: Comment = "#"
-    """Form of the header comment."""
+    """Syntax and place of the comment with notes in the file."""
     content: Any = None
     """Content: a document that is written as YAML, or a text with values in braces; None for the complete result.
 
@@ -44,17 +44,17 @@ class ExportFormat:
     of calibration or settings, or defined in `registry.py`. "minus_name" is the negative of a vector, "name_xyz" its
     components as in ROS messages; `registry.py` defines the other suffixes."""
     notes: tuple[str, ...] = ()
-    """Sentences for the user of the target, with values in braces."""
+    """Sentences about what the user of the target must know, with the names of values in braces."""
     elsewhere: Mapping[str, str] = field(default_factory=dict)
-    """Values that the target reads from another place, by their names in that place, with "$name" as in `content`."""
+    """Values that the user must set in another file of the target, by their names there; "$name" as in `content`."""
 
     @property
     def has_own_reading(self) -> bool:
-        """Whether the target reads another sensor or none, so that bias and response of this one do not matter."""
+        """Whether the target does not read the calibrated sensor, so that its bias and response do not matter."""
         return "bias" not in self.subtracts and "response" in self.expresses
 
 
-# A target that looks up frames relies on the robot model, so the note contains the required angles.
+# Note for targets that look up the sensor's orientation in the robot model, with the angles that must be in it.
 _FRAMES: Final = (
     "In the robot model, {sensor_frame} must be rotated from {flange_frame} by roll, pitch, yaw = ({rpy_rad_words}) "
     "rad: the formats urdf and static-transform write this rotation. {base_frame} must have the axes of {base_axes}."

@@ -1,4 +1,4 @@
-"""Writes the formats in `formats.py` and the complete JSON and YAML, and computes the error of a target."""
+"""Exports a calibration in the formats of `formats.py` or as complete JSON or YAML, with the error of the target."""
 
 import json
 import re
@@ -30,14 +30,14 @@ from ftdrive.stream.samples import sensor_origin_m
 
 FORMAT = "ftdrive.export/1"
 
-# Fields with the same names and definitions as in a calibration file.
+# Fields of the complete export with the same names and definitions as in calibration.json.
 _FIELDS = (
     *("mass_kg", "g_m_s2", "weight_N", "gravity_force_base_N"),
     *("R_flange_sensor", "p_sensor_com_m", "force_bias_N", "torque_bias_Nm"),
 )
 
 
-# A name must also be valid inside an XML comment, where `--` is an error.
+# Valid names of frames; `--` is excluded, because it is an error in an XML comment.
 _NAME = re.compile(r"[A-Za-z_](-?[A-Za-z0-9_./])*")
 # From ur_description/urdf/ur_macro.xacro, joint base_link-base_fixed_joint: 180° about z. ROS users have base_link;
 # without this rotation a tilt would be wrong without a message.
@@ -51,20 +51,20 @@ class Settings:
     """Names, and measured values or None. Raises `ConfigError` for a name that is invalid in files."""
 
     base_frame: str = "base"
-    """Frame of the controller's base, or `base_link` of a UR in ROS, with any prefix."""
+    """Name of the base frame, with any prefix: `base` is that of the controller, `base_link` that of a UR in ROS."""
     flange_frame: str = "tool0"
-    """Frame of the flange with z out, or `flange` of ROS-Industrial with x out, with any prefix."""
+    """Name of the flange frame, with any prefix: `tool0` has z out of the flange, `flange` of ROS-Industrial x."""
     sensor_frame: str = "ft_sensor"
-    """Frame of the sensor, also used as the name of the sensor."""
+    """Name of the sensor's frame, and of the sensor itself."""
     tool_frame: str = "tool"
     height_mm: float | None = None
-    """Height of the sensor's origin above the flange face, mm."""
+    """Height of the sensor's origin above the flange face, mm; None if unknown."""
     sensor_mass_kg: float | None = None
-    """Mass of sensor and adapter, kg."""
+    """Mass of sensor and adapter, kg; None if unknown."""
     sensor_com_mm: tuple[float, ...] | None = None
-    """Centre of mass of sensor and adapter from the flange, flange axes, mm; None: halfway up on the flange axis."""
+    """Centre of mass of sensor and adapter, mm, flange axes; None means that it is taken as halfway up the sensor."""
     verification: VerificationRecord | None = None
-    """Last verification of the calibration; None if there is none."""
+    """Last verification of the calibration; None if it was not verified."""
 
     def __post_init__(self) -> None:
         for field_name in ("base_frame", "flange_frame", "sensor_frame", "tool_frame"):
@@ -79,7 +79,7 @@ class Settings:
 
 
 def recorded_sensor(path: Path, calibration: CalibrationResult) -> tuple[float | None, float | None]:
-    """Return the sensor's height (mm) and mass (kg) configured for a calibration, file or run; None if unknown."""
+    """Return the sensor's height, mm, and mass, kg, in the configuration of the calibration's run; None if unknown."""
     folder = path if path.is_dir() else path.resolve().parent
     if path.is_dir() or (folder.name == calibration.provenance.get("run") and is_run(folder)):
         sensor = Run(folder).header().get("config", {}).get("sensor", {})
@@ -90,15 +90,15 @@ def recorded_sensor(path: Path, calibration: CalibrationResult) -> tuple[float |
 
 
 def _yaml(document: Any) -> str:
-    # YAML 1.1 reads 1e-05 as text and yes as true; PyYAML quotes such texts.
+    # PyYAML writes numbers and texts as YAML 1.1 needs them, which reads 1e-05 as a text and yes as true.
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10**6)
 
 
 @dataclass(frozen=True, slots=True)
 class _Values:
-    """Values for an export by name, from `_VALUES`, the calibration or the settings, in the unit that the name states.
+    """The values that formats name: from `_VALUES`, the calibration or the settings, in the unit that the name states.
 
-    Raises `ConfigError` for a value that was not measured.
+    Raises `ConfigError` for a value that is needed but was not measured.
     """
 
     target: str
@@ -115,11 +115,11 @@ class _Values:
             value = -np.array(self[name.removeprefix("minus_")])
         else:
             value = getattr(self.calibration if hasattr(self.calibration, name) else self.settings, name)
-        # avoid negative zeros in files
+        # adding 0.0 turns negative zeros into zeros
         return (np.ravel(value) + 0.0).tolist() if isinstance(value, np.ndarray) else value
 
     def filled(self, node: Any) -> Any:
-        """Return a part of a document with its values filled in."""
+        """Return a part of a format's document in which values replace "$name" and "*name"."""
         if isinstance(node, Mapping):
             return {key: self.filled(value) for key, value in node.items()}
         if isinstance(node, list):
@@ -128,29 +128,29 @@ class _Values:
 
     @property
     def is_turned(self) -> bool:
-        """Whether the base frame is `base_link` of ROS."""
+        """Whether the base frame is `base_link` of ROS, which is turned by 180° from the controller's base."""
         return self.settings.base_frame.endswith("base_link")
 
     @property
     def R_frame_flange(self) -> Array:
-        """Orientation (3, 3) of the flange, z out, in the flange frame of this name."""
+        """Orientation (3, 3) of the flange axes (z out) in the frame `flange_frame`, whose x may point out instead."""
         return _R_FLANGE_TOOL0 if self.settings.flange_frame.endswith("flange") else np.eye(3)
 
     @property
     def R_frame_sensor(self) -> Array:
-        """Orientation (3, 3) of the sensor in the flange frame."""
+        """Orientation (3, 3) of the sensor in the frame `flange_frame`."""
         return self.R_frame_flange @ self.calibration.R_flange_sensor
 
     @property
     def gravity_base_m_s2(self) -> Array:
-        """Gravity (3,), axes of the controller's base, pointing down; along -z for a tool without mass."""
+        """Gravity (3,), m/s², in axes of the controller's base; for a tool without mass, it is taken along -z."""
         if self.calibration.mass_kg == 0.0:
             return np.array([0.0, 0.0, -self.calibration.g_m_s2])
         return self.calibration.gravity_force_base_N / self.calibration.mass_kg
 
     @property
     def p_flange_sensor_m(self) -> Array:
-        """Position (3,) of the sensor's origin in the flange."""
+        """Position (3,) of the sensor's origin, m, flange axes. Raises `ConfigError` if its height is unknown."""
         if self.settings.height_mm is None:
             raise ConfigError(
                 f"{self.target} needs the height of the sensor's origin above the flange face, which gravity does not "
@@ -160,7 +160,7 @@ class _Values:
 
     @property
     def payload(self) -> FlangeLoad:
-        """The load of everything that the flange carries."""
+        """Mass and centre of mass of everything that the flange carries: sensor, adapter and tool."""
         height_m = float(self.p_flange_sensor_m[2])
         if self.settings.sensor_mass_kg is None:
             raise ConfigError(
@@ -185,13 +185,13 @@ class _Values:
 def _rpy_rad(v: _Values) -> Array:
     """Return the sensor's roll, pitch and yaw as in URDF: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     with warnings.catch_warnings():
-        # at a pitch of 90 degrees, roll is set to zero
+        # SciPy warns at a pitch of 90 degrees, where it sets one of the other angles to zero
         warnings.simplefilter("ignore")
         return Rotation.from_matrix(v.R_frame_sensor).as_euler("xyz")
 
 
 def _quaternion(v: _Values) -> Array:
-    """Return the orientation of the sensor as a quaternion, with the scalar last and not negative."""
+    """Return the sensor's orientation in `flange_frame` as a quaternion, with the scalar last and not negative."""
     return Rotation.from_matrix(v.R_frame_sensor).as_quat(canonical=True)
 
 
@@ -202,7 +202,7 @@ def _payload_inertia(v: _Values) -> str:
     payload, Q, (tool_kg, p_sensor_com_m) = v.payload, v.calibration.R_flange_sensor, true_tool(v.calibration)
     tool_m = v.p_flange_sensor_m + Q @ p_sensor_com_m - payload.p_flange_com_m
     sensor_kg = payload.mass_kg - tool_kg
-    # Moments of the two point masses about their common centre.
+    # add the moments of two point masses, sensor and tool, about their common centre
     reduced_kg = tool_kg + (tool_kg**2 / sensor_kg if sensor_kg > 0 else 0.0)
     total = Q @ J @ Q.T + reduced_kg * (tool_m @ tool_m * np.eye(3) - np.outer(tool_m, tool_m))
     return str(_FORMS["fixed"](total[_DIAGONAL_FIRST]))
@@ -233,12 +233,12 @@ def _assumption_note(v: _Values) -> str:
 
 
 _DIAGONAL_FIRST: Final = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
-# Suffixes of names that give a value a certain form.
+# Suffixes of the names in formats, with the form that each gives to the value.
 _FORMS: Mapping[str, Callable[[Any], Any]] = {
-    "xyz": lambda value: dict(zip("xyz", value, strict=True)),  # ROS messages have vectors in this form
+    "xyz": lambda value: dict(zip("xyz", value, strict=True)),  # as vectors in ROS messages
     "words": lambda value: ", ".join(map(str, value)),
     "spaced": lambda value: " ".join(map(repr, value)),
-    "fixed": lambda value: ", ".join(f"{one:.12f}" for one in value),  # the URScript manual mentions no exponents
+    "fixed": lambda value: ", ".join(f"{one:.12f}" for one in value),  # URScript documents no exponents
     "yaml": lambda value: _yaml(value).removesuffix("\n").removesuffix("\n..."),
 }
 _VALUES: Mapping[str, Callable[[_Values], Any]] = {
@@ -273,20 +273,20 @@ _VALUES: Mapping[str, Callable[[_Values], Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """The text for one target, and what its user must know."""
+    """A calibration exported for one target: the text of its file, and what the user of the target must know."""
 
     text: str
     notes: tuple[str, ...]
-    """Sentences for the user of the target."""
+    """Sentences about what the user of the target must know."""
     elsewhere: Mapping[str, JSON]
-    """Values that the target reads from another place, by their names in that place."""
+    """Values that the user must set in another file of the target, by their names there."""
     max_force_error_N: float
-    """Largest difference from `CalibrationResult.compensate` for a free tool, over all orientations, N."""
+    """Largest difference, N, of the target's compensation from that of ftdrive, for a free tool in any orientation."""
     max_torque_error_Nm: float
 
 
 def _compensation_document(calibration: CalibrationResult, settings: Settings) -> dict[str, JSON]:
-    """Return everything that the user's own program needs for the compensation.
+    """Return the complete export: everything that the user's own program needs for the compensation.
 
     With u = R_flange_sensor^T R_base_flange^T gravity_force_base_N, the weight in the sensor frame, and zeros without
     `response`:
@@ -320,12 +320,12 @@ def _compensation_document(calibration: CalibrationResult, settings: Settings) -
 
 
 _STEPS = 500
-# The ascent has converged if no start increases by more than this relative amount in a step.
+# The search in `_largest_norm` has converged if no norm increases by more than this fraction in a step.
 _CONVERGED = 1e-12
 
 
 def _compensations(calibration: CalibrationResult, target: ExportFormat) -> tuple[Compensator, Compensator]:
-    """Return how ftdrive compensates a free tool, and how a target does that can express only what `expresses` lists.
+    """Return the compensators of ftdrive and of the target, which can express only what `target.expresses` lists.
 
     Without tilt, gravity points along -z of the base. Without rotation, the sensor axes equal the flange axes. If the
     target reads another sensor or none, the response of this sensor is left out of both.
@@ -399,7 +399,7 @@ def export_calibration(
     if target.subtracts and "response" not in target.expresses:
         notes += _undecoded(name, calibration)
     elsewhere = values.filled(target.elsewhere)
-    # The header in the file has all digits.
+    # printed notes have six digits, the header in the file has all
     shown, exact = (
         [*notes, *(f"Also set {place} = {_describe_value(value, form)}." for place, value in elsewhere.items())]
         for form in (".6g", "")
@@ -425,7 +425,7 @@ def _lost(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]
 
 
 def _undecoded(name: str, calibration: CalibrationResult) -> Iterator[str]:
-    """Yield a note with the largest error of a contact force if the target cannot decode contacts."""
+    """Yield a note with the largest error of a contact force, because the target cannot apply the sensor matrix."""
     if (decoder := calibration.contact.decoder) is None:
         return
     at_tool = np.concatenate([np.eye(3), skew(calibration.p_sensor_com_m)])

@@ -1,4 +1,4 @@
-"""Plans as URScript programs for the pendant, or as tables; and URScript functions for `serve-load`.
+"""Plans as URScript programs for the pendant, or as tables; URScript functions that use `ftdrive serve-load`.
 
 Ref: Universal Robots, "The URScript Programming Language", SW 5: movej, get_actual_joint_positions, popup, textmsg,
 read_input_integer_register, read_input_float_register, write_output_integer_register, read_output_integer_register,
@@ -23,7 +23,7 @@ _FASTEST_RAD_S, _FASTEST_RAD_S2 = pi + 1e-9, radians(300) + 1e-9
 
 
 def plan_table(plan: Plan) -> str:
-    """Return one line per pose, with speed, acceleration and clearance of the move to the next one (finally the first).
+    """Return a plan as CSV: a line per pose, with speed, acceleration and clearance of the move to the next pose.
 
     The first line is a comment with the format, the plan's hash, the model, and whether the cell was emulated.
     """
@@ -40,7 +40,7 @@ APPROACH_RAD_S, APPROACH_RAD_S2 = radians(10), radians(20)
 
 
 def program(plan: Plan, *, dwell_s: float) -> str:
-    """Return a function that visits the poses of a plan, stops for `dwell_s` at each, and returns to the first.
+    """Return a URScript function that visits the poses of a plan, dwells at each, and returns to the first.
 
     Raises `PlanRefused` if a move is not proven clear, or if no arm can reach a value in the plan.
     """
@@ -156,8 +156,8 @@ def _cylinder(part: dict[str, Any]) -> str:
 
 
 def _require_exportable(plan: Plan) -> None:
-    """Raise `PlanRefused` for sweeps, placeholders, moves not proven clear, and values that no arm can reach."""
-    # The exported text contains no verdict, so plans that are not proven clear are not exported.
+    """Raise `PlanRefused` for a sweep, unmeasured surroundings, a move not proven clear, or values no arm can reach."""
+    # A plan that is not proven clear is refused, because the exported text could not show that.
     if plan.sweep is not None:
         raise PlanRefused("this plan is a sweep, which no other program can follow: export the plan of a tour")
     if not plan.measured:
@@ -177,15 +177,15 @@ def _require_exportable(plan: Plan) -> None:
         raise PlanRefused("the plan has a joint angle, speed or acceleration that no arm can reach: make a new plan")
 
 
-# If the live counter does not change for this time, s, the service is considered stopped.
+# URScript functions take `serve-load` as stopped if its live counter does not change for this time, s.
 STALE_S: Final = 0.06
-# Time-out of a request, s, and the states of a request without an answer.
+# Time-out, s, of a request to `serve-load`; states of a request that has no answer or no value.
 LIMIT_S: Final = 2.0
 GONE, LATE, UNSEEN = -1, -2, -3
 
 
 def functions(first: int, *, example: bool = False) -> str:
-    """Return the functions for registers starting at `first`, as in `serve-load --first`.
+    """Return the URScript functions for `serve-load`, with registers from `first` on, as in `serve-load --first`.
 
     With `example`, append a program that weighs a part and sets the payload.
     """

@@ -49,7 +49,7 @@ class Canvas(ABC):
 
     @abstractmethod
     def draw(self, width: int, height: int) -> Sequence[Line]:
-        """Return the lines to show; missing lines stay empty. An error ends the screen."""
+        """Return the lines to show, `height` or fewer; the others stay empty. An error in it ends the screen."""
 
     @abstractmethod
     def turns(self) -> Iterable[object]:

@@ -308,7 +308,7 @@ def sphere(view: View) -> list[Line]:
 
 
 def _half_sphere(known: Array, down: Array) -> list[Line]:
-    """Draw one hemisphere, seen along z, with directions (n, 3); the distance from the centre shows the angle."""
+    """Draw directions (n, 3) on a hemisphere seen along z; the distance from the centre is linear in the angle."""
     rows, angle = _DISC // 2, np.linspace(0, 2 * np.pi, 200)
     dots = np.zeros((4 * rows, 2 * _DISC), np.bool_)
     for radius in (0.5, 1.0):

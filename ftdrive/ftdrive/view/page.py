@@ -56,7 +56,7 @@ class Page:
         self._acts[name] = act
 
     def add_stop(self, stop: Callable[[str], object]) -> None:
-        """Show a Stop button; `stop` is called in another thread, with the name of the viewer."""
+        """Show a Stop button; when it is pressed, `stop` is called in the server thread with the viewer's name."""
         self.put({"stop": controls(button("stop", "Stop", key="q"), note="Stops the arm. No emergency stop.")})
         self.on("stop", lambda viewer, _: stop(viewer))
 

@@ -48,7 +48,7 @@ class PlanTimeline:
         return int(np.searchsorted(self.begins_s, t_s, side="right")) - 1
 
     def slider(self, t_s: float) -> Part:
-        """Return the slider `along` at a time, with a text that states pose and time."""
+        """Return the slider for the time along the plan, set to a time, with a text that states pose and time."""
         pose = f"pose {self.move(t_s) + 1} of {len(self.begins_s)}, " if self.move(t_s) >= 0 else "approach, "
         words = f"{'' if self.plan.sweep else pose}{t_s:.0f} of {self.end_s:.0f} s"
         return slider("along", "Along the plan", round(t_s, 1), round(self.end_s, 1), step=0.1, text=words)
@@ -137,7 +137,7 @@ def _swept_scene(certifier: Certifier, q_rad: Array) -> dict[str, Part | None]:
 
 
 def describe_move(plan: Plan, move: int) -> tuple[str, str, str]:
-    """Return texts about a move, its smallest clearance, and the space to keep free."""
+    """Return three texts: about a move of a plan (-1: the approach), its smallest clearance, the space to keep free."""
     if move < 0:
         return "From the present posture to the first pose", "This approach is confirmed separately.", ""
     step, following = plan.steps[move], plan.steps[(move + 1) % len(plan.steps)]

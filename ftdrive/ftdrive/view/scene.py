@@ -20,7 +20,7 @@ FORCE, TORQUE, PATH, UNKNOWN = "force", "torque", "path", "unknown"
 def body(half_length_m: float, radius_m: float, rounding_m: float, colour: str, **more: Any) -> Part:
     """Return a cylinder along z with rounded edges: a capsule if the radius is 0, a ball if the length is 0 too.
 
-    `more` may be `at` (3,), `turn` (4,), a quaternion with w first, `alpha`, and `copies` (n, 7), positions and turns.
+    `more`: position `at` (3,), quaternion `turn` (4,), w first, opacity `alpha`, `copies` (n, 7) with `at` and `turn`.
     """
     shape = rounded_list([half_length_m, radius_m, rounding_m])
     return {"kind": "body", "shape": shape, "colour": colour} | {

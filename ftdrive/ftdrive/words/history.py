@@ -13,24 +13,24 @@ from ftdrive.store.history import age_days
 from ftdrive.store.records import StoredResult
 from ftdrive.words.text import GLUE
 
-if TYPE_CHECKING:  # listing results must not import numpy
+if TYPE_CHECKING:  # listing results must not import numpy, which takes long
     from ftcalib.after.series import BiasTemperature
 
 DAY_TITLES = ("day", "arm", "tool", "parts", "refused", "last, UTC", "mass", "file")
 _TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias, N", "run", "°C", "parent")
-# Columns that are shown only if some result has a value.
+# Columns of the table of results that are shown only if a result has a value in them.
 _OPTIONAL = {"°C", "parent"}
 
 
 def tool_in_words(tool: str | None, *, emulated: bool) -> str:
-    """Return the name of a tool, marked EMULATED for an emulated cell."""
+    """Return the name of a tool, with the mark EMULATED for one in an emulated cell."""
     if not emulated:
         return tool or "-"
     return EMULATED if tool in (None, "emulated") else f"{tool} {EMULATED}"
 
 
 def last_weighing_in_words(one: WeighingDay) -> str:
-    """Return the tool, the time and the mass of a day's last part, and the number of parts."""
+    """Return a text about a day of weighings: tool, time and mass of the last part, and the number of parts."""
     counts = f"{counted(one.weighings, 'part')}, {sum(one.refusals.values())} refused on this day"
     time = one.day if one.last_utc is None else one.last_utc[:16].replace("T", " ")
     return f"{tool_in_words(one.tool, emulated=one.emulated)}, {time}: {_mass_in_words(one)}; {counts}"
@@ -56,7 +56,7 @@ def _mass_in_words(one: WeighingDay) -> str:
 
 
 def day_row(one: WeighingDay) -> tuple[str, ...]:
-    """Return the weighings of a day as a row of the table with `DAY_TITLES`."""
+    """Return a day of weighings as a row of the table whose titles are `DAY_TITLES`."""
     return (
         one.day,
         one.arm_serial or one.robot_host or "-",

@@ -1,4 +1,4 @@
-"""Texts for work with known loads: checking a sensor, and estimating its matrix."""
+"""Texts of `ftdrive loads`: the check of a sensor with a known load, and the estimate of its matrix from several."""
 
 from collections.abc import Iterator
 from math import degrees
@@ -14,7 +14,7 @@ from ftcalib.sensor_matrix import SensorMatrix
 
 
 def check_lines(found: LoadCheck, load: KnownLoad) -> Iterator[str]:
-    """Yield the reading of a known load, and whether its error is within the uncertainty stated for the sensor."""
+    """Yield lines about a known load: its reading, and whether the error is within what is stated for the sensor."""
     off = with_sigma(100 * found.scale_error, 100 * found.scale_sigma, "+")
     yield f"reads {found.read_N:.3f} N, expected {found.expected_N:.3f} N: {off} %"
     line = ""
@@ -31,7 +31,7 @@ def check_lines(found: LoadCheck, load: KnownLoad) -> Iterator[str]:
 
 
 def solution_lines(solution: LoadSolution, prior: SensorMatrix) -> Iterator[str]:
-    """Yield lines with the loads, the tool, the matrix and the findings of a solution."""
+    """Yield lines about a sensor matrix estimated from known loads: loads, tool, matrix, findings."""
     yield f"{'load':14}{'mass, kg':>22}{'place from the flange, mm':>44}"
     for one in solution.loads:
         place = ", ".join(
@@ -46,7 +46,7 @@ def solution_lines(solution: LoadSolution, prior: SensorMatrix) -> Iterator[str]
 
 
 def matrix_lines(sensor: SensorMatrix, tip_m: float, beside: str) -> Iterator[str]:
-    """Yield a line with the gain errors, and a line with the sigma of a contact at the tip and the text `beside`."""
+    """Yield lines about a sensor matrix: its gain errors; the sigma of 100 N at the tool tip, and the text `beside`."""
     diagonal = zip(AXES, sensor.error.diagonal(), sensor.sigma.diagonal(), strict=True)
     yield "diagonal, %: " + ", ".join(f"{axis} {with_sigma(100 * e, 100 * s, '+')}" for axis, e, s in diagonal)
     force, torque = _contact_sigma(sensor, tip_m)
@@ -54,7 +54,7 @@ def matrix_lines(sensor: SensorMatrix, tip_m: float, beside: str) -> Iterator[st
 
 
 def _contact_sigma(sensor: SensorMatrix, tip_m: float) -> tuple[float, float]:
-    """Return the sigmas of force and torque for 100 N at the tip: the norm of the error, averaged over directions."""
+    """Return the sigmas of force, N, and torque, N·m, for 100 N at the tip, as rms of the error over all directions."""
     nothing = Parameters(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
     force, torque = sensor.contact_response(nothing).sigma_at(np.array([0, 0, tip_m]))
     return 100 * force, 100 * torque

@@ -1,4 +1,4 @@
-"""Texts about a result and a verification."""
+"""Texts about the result of a calibration, and about a verification."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal
@@ -17,13 +17,13 @@ from ftdrive.words.text import TextLine
 
 # Largest number of findings shown, so that verdict, findings and next command fit on one screen.
 _MOST_FINDINGS = 3
-# An error elsewhere or later is shown if it is larger by more than this factor.
+# The compensation error in any orientation, or an hour later, is shown if larger by more than this factor.
 _WORSE = 1.2
 _ELSEWHERE: Sequence[tuple[str, Literal["workspace", "hour"]]] = (
     ("in any orientation", "workspace"),
     ("after an hour", "hour"),
 )
-# Values below this, in N, N·m or as a share of a mass, are rounding errors.
+# Values below this, in N, N·m or as a fraction of a mass, are rounding errors.
 _ROUNDING = 1e-9
 SIGMA_OF_THE_TOOL = (
     "that of mounting, weight and centre of mass includes errors of sensor, arm and mounts; the "
@@ -34,7 +34,7 @@ SIGMA_OF_THE_TOOL = (
 def estimate_rows(
     document: Mapping[str, Any], truth: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[str, int, str, str, str, str]]:
-    """Yield for each number in a result's JSON: key, axis, name with unit, true value if known, value, sigma."""
+    """Yield for each estimated number in a result's JSON: key, axis, and as texts name, true value, value, sigma."""
     for one in shown_estimates(document):
         label, scale, unit, key, values, sigmas, fixed = one
         truths = values_of(truth[key], key) * scale if truth is not None and key in truth else None
@@ -46,7 +46,7 @@ def estimate_rows(
 
 
 def mass_in_words(result: CalibrationResult) -> str | None:
-    """Return the mass with both parts of its sigma; None if the mass was given or the sensor is declared perfect."""
+    """Return the mass with its sigma from the sensor's scale and that of the session; None if either sigma is zero."""
     session_kg = result.parameters.weight_sigma_N(result.covariance) / result.g_m_s2
     if session_kg < _ROUNDING * result.mass_kg or result.scale_sigma <= LEAST_COMMON_GAIN:
         return None
@@ -55,7 +55,7 @@ def mass_in_words(result: CalibrationResult) -> str | None:
 
 
 def error_in_words(result: CalibrationResult) -> str:
-    """Return the expected compensation error of a free tool, N and N·m, and where or when it is larger."""
+    """Return a text with the expected compensation error of a free tool, and where or when it is larger."""
     likely = result.likely_error()
     words = "{:.4f} N, {:.5f} N·m rms".format(*likely)
     if result.noise_explains and (likely == result.predicted_error()).all():
@@ -74,7 +74,7 @@ def error_in_words(result: CalibrationResult) -> str:
 
 
 def error_source(result: CalibrationResult) -> str:
-    """Return how the compensation error was determined, and the error predicted from the noise alone."""
+    """Return a text about how the compensation error was determined, with the error predicted from noise alone."""
     sources = ["predicted from the noise: {:.4f} N, {:.5f} N·m".format(*result.predicted_error())]
     if result.motion is None and not result.noise_explains:
         why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
@@ -92,7 +92,7 @@ def conclusion(
     hinted: bool = True,
     every: bool = False,
 ) -> list[TextLine]:
-    """Return the conclusion about a result: compensation error, findings and what to do.
+    """Return the lines of text about a result: compensation error, findings and what to do.
 
     Without `every`, include at most three findings that need an action, one per code, so that verdict and next command
     stay on one screen.
@@ -102,7 +102,7 @@ def conclusion(
     result : CalibrationResult
     drift : DriftCheck, optional
     records : sequence of PoseRecord
-        Records, to name the poses and explain bad fits.
+        Records of the solved poses, to name the poses and to explain those that fit badly.
     hinted : bool
         Include hints about what to check in the cell.
     every : bool
@@ -160,7 +160,7 @@ def _two_digits(value: float) -> str:
 
 
 def sensor_in_words(result: CalibrationResult) -> str:
-    """Return where the sensor errors under contact come from."""
+    """Return a text about the source of the sensor errors under contact: assumed, data sheet, or known loads."""
     sensor = result.sensor
     if sensor is None or sensor.source == "assumed":
         return "assumed, not measured"
@@ -171,13 +171,13 @@ def sensor_in_words(result: CalibrationResult) -> str:
 
 
 def contact_in_words(result: CalibrationResult) -> str:
-    """Return the sigma of a contact force at the tip, and where the sensor errors in it come from."""
+    """Return a text with the sigma of a contact force at the tool tip, and the source of the sensor errors in it."""
     sigma_N = float(force_sigma_at_tip(result))
     return f"{CONTACT_N:g} N at the tip ± {sigma_N:.2g} N (1 sigma); errors of the sensor are {sensor_in_words(result)}"
 
 
 def drift_in_use(result: CalibrationResult) -> str | None:
-    """Return how the bias changes after the last pose; None without drift, or for a calibration in motion."""
+    """Return a text about the bias's change after the last pose; None without drift, or for a calibration in motion."""
     growth = np.array(result.quality.get("bias_growth_per_min", ()))
     if result.mean_bias is None or not growth.size:
         return None
@@ -201,7 +201,7 @@ def _poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str
 
 
 def truth_in_words(result: CalibrationResult, truth: Mapping[str, Any]) -> str:
-    """Return the readings of a free tool in a known cell, after and before compensation."""
+    """Return a text with the readings of a free tool after and before compensation, computed from the truth."""
     left = compensation_error(result, truth)
     return (
         f"a free tool reads {left['force_rms_N']:.4f} N, {left['torque_rms_Nm']:.5f} N·m rms; "
@@ -219,12 +219,12 @@ def residuals_in_words(result: CalibrationResult) -> str:
 
 
 def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
-    """Return how the first pose changed when it was repeated at the end, and whether by more than the noise."""
+    """Return a text about the change of the first pose when repeated at the end; True if it exceeds the noise."""
     worst = float(np.max(np.abs(drift.change) / drift.sigma))
     force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
     apart_s = abs(drift.elapsed_s)
     again = f"first pose again after {apart_s:.0f} s"
-    if drift.elapsed_s < 0:  # --redo 1 records the first pose last
+    if drift.elapsed_s < 0:  # with --redo 1
         again = f"first pose, repeated {apart_s:.0f} s after the return to it"
     words = f"{again}, {force_N:.3f} N, {torque_Nm:.4f} N·m away: "
     if worst < 4:
@@ -236,7 +236,7 @@ def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
 
 
 def verification_in_lines(verified: Verified, *, every: bool = False) -> list[TextLine]:
-    """Return the lines about a verification: largest differences with the limits, the changes, and what to do."""
+    """Return lines of text about a verification: largest differences with the limits, changes, and what to do."""
     found = verified.verification
     lines = [TextLine("", _verdict_in_words(verified))]
     lines += [] if found.passed else [TextLine("   ", found.reason, "yellow")]

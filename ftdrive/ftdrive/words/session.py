@@ -1,4 +1,4 @@
-"""Texts about a session and a push (plan, questions, estimates, changes), and `SessionView`, the state to show."""
+"""Texts about a session and about `ftdrive push`, and `SessionView`, the state that screen and page show."""
 
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -36,7 +36,7 @@ from ftdrive.words.result import drift_in_words
 from ftdrive.words.text import TextLine
 from ftdrivers.interfaces import ControllerSettings
 
-# Label with unit, factor from SI, name, and rank on the screen (higher ranks are omitted first).
+# Estimates on the screen: label with unit, factor from SI, name, and rank (without enough room, the highest go first).
 ESTIMATES = (
     ("mass kg", 1.0, "mass_kg", 1),
     ("centre mm", 1e3, "p_sensor_com_m", 2),
@@ -47,10 +47,10 @@ ESTIMATES = (
     ("tilt b deg", 180 / np.pi, "tilt_beta_rad", 6),
 )
 _NUMBER_WIDTH = 9
-# A standard deviation below this, N or N·m, is a rounding error of a value that was not fitted.
+# A drift with a standard deviation below this, N or N·m, was not fitted.
 _ROUNDED = 1e-9
 OFF_SIGMA = 5.0
-"""A pose that differs by more standard deviations than this is an outlier."""
+"""A pose is an outlier if it differs from the fit or prediction by more standard deviations than this."""
 
 _ASCII = str.maketrans(
     dict(zip("┌┐└┘├┤┬┴┼─│━", "+++++++++-|=", strict=True))
@@ -59,7 +59,7 @@ _ASCII = str.maketrans(
 
 
 class SessionText:
-    """Converts events to lines of text, in sections with headings; without `poses`, poses get no lines.
+    """Converts the events of a session to lines of text with headings; without `poses`, those of poses give none.
 
     `verbose` adds a line per check, the table of the plan, and the estimate after each pose. Otherwise, passed checks
     share one line, and the plan has three lines.
@@ -72,7 +72,7 @@ class SessionText:
         self._passed = list[str]()
 
     def lines(self, event: Event) -> list[TextLine]:
-        """Return the lines to print for an event, after the lines that were still pending."""
+        """Return the lines to print for an event, preceded by those that were held back, see `pending`."""
         if isinstance(event, Checked) and event.passed and not self._verbose:
             heading = [] if self._passed else self._heading("Checks")
             self._passed.append(event.name)
@@ -83,7 +83,7 @@ class SessionText:
         return waiting + self._heading_before(event) + body
 
     def pending(self) -> list[TextLine]:
-        """Return a line with the checks that have passed so far, if there are any."""
+        """Return the line that was held back: the checks that have passed so far; empty if there are none."""
         passed, self._passed = self._passed, []
         return [TextLine(" ✔ ", ", ".join(passed), "green")] if passed else []
 
@@ -94,7 +94,7 @@ class SessionText:
                 return self._heading("Plan")
             case Checked():
                 return self._heading("Checks")
-            # a run that is resumed is opened before its plan is known
+            # no heading for a resumed run, which is opened before its plan is known
             case RunOpened() if not self._sections:
                 return []
             case RunOpened() | PoseTaken() | StateChanged(state=State.APPROACH | State.MOVE | State.SWEEP):
@@ -103,7 +103,7 @@ class SessionText:
                 return []
 
     def _heading(self, name: str) -> list[TextLine]:
-        """Return each heading only once, because later checks, after a stop, belong to the tour."""
+        """Return a heading, but only the first time, because checks after a stop belong to the tour."""
         if name in self._sections:
             return []
         self._sections.append(name)
@@ -153,18 +153,18 @@ def _plan_in_brief(plan: Plan) -> tuple[str, str]:
 
 
 def in_words(event: Event) -> str:
-    """Return the text for an event: several lines for a plan, else one; empty for events that only a screen shows."""
+    """Return an event of a session as text: several lines for a plan, else one; empty if only a screen shows it."""
     return "".join(_head_and_words(event))
 
 
 def _head_and_words(event: Event) -> tuple[str, str]:
-    """Return the mark before an event's text, and the text; further lines are indented past the mark."""
+    """Return the mark before an event's text, such as "✔ ", and the text, whose further lines start after the mark."""
     match event:
         case RunOpened():
             return "", f"kept in {event.folder}" + (
                 f"; after a stop, continue with\n{event.resume}" * bool(event.resume)
             )
-        case StateChanged(state=State.HOLD):  # this text also describes STOP
+        case StateChanged(state=State.HOLD):  # STOP has this text too
             return "", f"{event.state.upper()}: {event.words}"
         case StateChanged(state=State.PREFLIGHT | State.APPROACH | State.SWEEP | State.CLOSE):
             return "", f"{event.state}{': ' if event.words else ''}{event.words}"
@@ -199,7 +199,7 @@ def _event_sentence(event: Event) -> str:
 
 
 def pose_in_words(event: PoseTaken) -> str:
-    """Return the text for an averaged pose, with its orientation number."""
+    """Return a text about a recorded pose: orientation number, settling time, samples, sigma."""
     force_N, torque_Nm = rms_sigma(event.sigma)
     flags = [*["NOT STEADY"] * (not event.steady), *[f"{event.attempts} attempts"] * (event.attempts > 1)]
     settled = f"settled {event.settle_s:.1f} s, {event.samples} samples in {event.average_s:.1f} s"
@@ -217,7 +217,7 @@ def _estimate_in_words(event: Estimated) -> str:
 
 
 def residual_in_words(event: Estimated) -> str:
-    """Return the residual of the newest pose with respect to the previous fit; empty if there is none."""
+    """Return a text with the newest pose's residual relative to the fit without it; empty without such a fit."""
     if event.residual_sigma is None or event.residual_force_N is None:
         return ""
     return f"{event.residual_force_N:.3f} N from the previous fit, {event.residual_sigma:.1f} sigma"
@@ -230,13 +230,13 @@ def _comparison_in_words(event: Compared) -> str:
 
 
 def differences(event: Compared) -> tuple[str, str, str]:
-    """Return a pose's differences from the prediction ± expected sigma, N and N·m, and the largest one in sigmas."""
+    """Return texts of a pose's differences from the prediction ± sigma, N and N·m, and of the largest in sigmas."""
     (N, Nm), (N_sigma, Nm_sigma) = (np.linalg.norm(six.reshape(2, 3), axis=1) for six in (event.residual, event.sigma))
     return f"{N:.3f} ± {N_sigma:.3f}", f"{Nm:.4f} ± {Nm_sigma:.4f}", f"{sigmas_of(event):.1f}"
 
 
 def sigmas_of(event: Compared) -> float:
-    """Return the largest of the six differences, each divided by its standard deviation."""
+    """Return the largest of a pose's six differences from the prediction, in standard deviations."""
     return float(np.max(np.abs(event.residual) / event.sigma))
 
 
@@ -244,7 +244,7 @@ _LEVEL_DEG = 0.05
 
 
 def proposal_in_lines(push: Push) -> list[str]:
-    """Return lines with the old and new values of the controller, and the reasons for and against the change."""
+    """Return lines about a push: the controller's old and new values, and what speaks for and against the change."""
     lines = _push_table(push)
     if (restored := push.reason.get("restores")) is not None:
         lines.append(f"The new values restore those before {restored}.")
@@ -294,7 +294,7 @@ def _payload(push: Push, load: FlangeLoad) -> list[str]:
 
 
 def settings_in_words(settings: ControllerSettings | None) -> str:
-    """Return the payload and gravity that a controller reports."""
+    """Return a text with the payload and gravity that a robot controller reports."""
     if settings is None or settings.mass_kg is None:
         return "the controller does not report its payload: compare it on the pendant"
     up = "" if settings.up_base_m_s2 is None else f", gravity {_format_vector(settings.up_base_m_s2, '.3f')} m/s²"
@@ -327,27 +327,27 @@ class SessionView:
     command: str = "calibrate"
     now: StateChanged | None = None
     since_s: float = 0.0
-    """Start time of the current state, on the screen's clock."""
+    """Start time of the current state, s, on the clock of the screen or page."""
     folder: str = ""
     resume: str = ""
     taken: dict[int, tuple[PoseTaken, float]] = field(default_factory=dict)
-    """Poses and their times, by stop."""
+    """Poses with the times of their events, s, by the number of the stop."""
     last: PoseTaken | None = None
     estimated: Estimated | None = None
     compared: dict[int, Compared] = field(default_factory=dict)
-    """In a verification, the comparisons by stop."""
+    """In a verification, the comparison of each pose with its prediction, by the number of the stop."""
     drift: DriftCheck | None = None
     note: Noted | GuardTripped | None = None
     tripped: bool = False
-    """Whether a guard has stopped the arm; STOP and HOLD then repeat its text."""
+    """Whether a guard has stopped the arm. The states STOP and HOLD, whose text repeats the guard's, show none then."""
     waiting: tuple[Key, ...] = ()
     ascii_only: bool = False
-    """Whether the terminal's encoding is ASCII."""
+    """Whether the terminal can show only ASCII characters."""
     keys: Literal["live", "asking", "over"] = "live"
-    """Whether keys are read now."""
+    """"live" while single keys are read, "asking" while a line is read as an answer, "over" at the end."""
 
     def update(self, event: Event, now_s: float) -> None:
-        """Update the state from an event."""
+        """Update the state by an event of the session, which came at `now_s`."""
         match event:
             case RunOpened():
                 self.folder, self.resume = event.folder, event.resume
@@ -366,12 +366,12 @@ class SessionView:
                 self.note, self.tripped = event, True
 
     def shown(self, text: str) -> str:
-        """Return text that the terminal can encode; it can be longer, so convert before measuring or cutting."""
+        """Replace characters that the terminal cannot show. This can lengthen a text, so measure it afterwards."""
         return text.translate(_ASCII) if self.ascii_only else text
 
     @property
     def kept(self) -> int:
-        """Number of stored poses; in a resumed run, only the fit knows all of them."""
+        """Number of stored poses. It includes poses from before a resume, which only the fit knows."""
         return max(len(self.taken), self.estimated.poses if self.estimated else 0)
 
     def _take(self, event: PoseTaken, now_s: float) -> None:
@@ -384,26 +384,26 @@ class SessionView:
 
 
 def progress_in_words(view: SessionView, now_s: float) -> str:
-    """Return the number of stored poses and the remaining time, on the clock of `SessionView.since_s`."""
+    """Return a text with the number of stored poses and the remaining time; `now_s` is on the clock of `since_s`."""
     times_s = sorted(at_s for _, at_s in view.taken.values())
     kept = view.kept
     left = view.last.stops - kept if view.last else 0
     if len(times_s) <= 2 or left <= 0:
         return f"{kept} kept"
-    # the median, because a stop with questions takes longer
+    # median time per pose, because a stop with questions takes longer
     usual_s = median(b - a for a, b in pairwise(times_s))
-    # during a hold, the remaining time does not shrink
+    # limited, so that the remaining time does not shrink during a hold
     rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)
     return f"{kept} kept, about {_minutes(rest_s)} left"
 
 
 def state_in_words(view: SessionView, now_s: float) -> tuple[str, str, str]:
-    """Return the position in the session, such as "pose 3/24 R05", the state with its duration, and a text about it."""
+    """Return three texts: the pose, such as "pose 3/24 R05"; the state and its duration; a text about the state."""
     now = view.now
     if now is None:
         return "", "recording" if view.folder else "starting", ""
     if view.keys == "asking" and now.state in {State.MOVE, State.SETTLE, State.SAMPLE}:
-        # the motion before the question has ended
+        # not the stored state, because the arm rests during a question
         return "", "WAITS for an answer", ""
     where = "" if now.stop is None else f"pose {now.stop}" + (f"/{now.stops}" if now.stops is not None else "")
     where += f" R{now.number:02d}" if where and now.number is not None else ""
@@ -412,7 +412,7 @@ def state_in_words(view: SessionView, now_s: float) -> tuple[str, str, str]:
 
 
 def coverage_in_words(fit: Estimated) -> str:
-    """Return how well the orientations so far determine the result."""
+    """Return a text about how well the poses so far determine the result: condition numbers and largest gap."""
     words = ""
     for name, what in (("cond9", "condition"), ("cond_u1", "out of plane")):
         value, goal = getattr(fit, name), GREEN[name]
@@ -423,7 +423,7 @@ def coverage_in_words(fit: Estimated) -> str:
 
 
 def drift_so_far(view: SessionView) -> TextLine:
-    """Return the drift of the bias since the first pose, from the fit or from the repeated first pose."""
+    """Return a line about the drift of the bias since the first pose, from the fit or the repeated first pose."""
     fit = view.estimated
     if view.drift is not None:
         words, bad = drift_in_words(view.drift)
@@ -446,7 +446,7 @@ def drift_so_far(view: SessionView) -> TextLine:
 
 
 def rounded_estimate(fit: Estimated | None, factor: float, name: str) -> tuple[list[str], str]:
-    """Return the values of an estimate times `factor` as texts, and the largest sigma; empty before the first fit."""
+    """Return an estimate's values times `factor` as texts, and its largest sigma; empty before the first fit."""
     if fit is None or name not in fit.values:
         return [], ""
     value: ArrayLike = fit.values[name]

@@ -1,4 +1,4 @@
-"""State and texts of a stream for screens and pages: a `StreamSummary` makes a `View` from a `Feed`."""
+"""State and texts of a stream for screens and pages: `StreamSummary` reads a `Feed` and makes a `View` to show."""
 
 import json
 from collections import deque
@@ -28,17 +28,17 @@ from ftdrive.stream.weighing import Weighing
 from ftdrivers.interfaces import NOT_REPORTED, Array
 
 _MOST_NOTES = 200
-# Events that are marked in plots; contacts have a colour, and a change of the frame clears the plots.
+# Kinds of events that plots mark. Contacts are coloured instead, and a change of the frame clears the plots.
 _MARKS = ("tare", "tare-undone", "stages", "gap", "mark")
-# Values below this number of sigmas may be noise, so no direction or line of action is shown.
+# A force or torque below this number of sigmas may be noise, so its direction or line of action is not shown.
 _SIGNIFICANT = 4.0
-# If nothing was read from the stream for longer than this, s, the command's output is probably blocked.
+# If the command has read nothing from the stream for longer than this, s, its output is probably blocked.
 _HELD_S = 2.0
 CONTACT, FREE, NOISE_UNKNOWN, WAITING = "contact", "free", "noise not known yet", "waiting for the first sample"
-"""Results of `state`."""
-# Smallest full scale, in sigmas, so that noise looks small in the plot of a still tool.
+"""The contact states that `state` returns."""
+# Smallest full scale of a plot, in sigmas of a sample, so that noise looks small if the tool is still.
 _LEAST_FULL_SIGMA = 10.0
-# Test values and limits above this are not shown: such a limit comes from an unusable noise estimate.
+# Contact-test values above this are not shown; a limit above this means that the noise is not known yet.
 _MOST_CHI2 = 1e5
 _FRAMES = (WrenchFrame(), WrenchFrame("flange", "flange"), WrenchFrame("base", "tcp"), WrenchFrame("tcp", "tcp"))
 # A delay estimate whose sigma exceeds this, s, is shown as not measured.
@@ -47,23 +47,23 @@ _MEASURED_S = 0.03
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownWrench:
-    """Mean of the samples of the last 0.1 s."""
+    """The wrench to show: the mean of the samples of the last 0.1 s, with its sigmas and the newest pose."""
 
     t_host_ns: int
     wrench: Array
-    """(6,) N and N·m, in `frame`."""
+    """(6,) mean wrench after the stages, N and N·m, in `frame`."""
     raw: Array
-    """(6,) N and N·m, sensor axes, about the sensor origin."""
+    """(6,) mean measured wrench, N and N·m, sensor axes, about the sensor origin."""
     raw_in_frame: Array
-    """(6,) the raw wrench in `frame`."""
+    """(6,) the mean measured wrench `raw`, transformed to `frame`."""
     sigma: Array
     """(6,) sigma of `wrench` due to noise, calibration and sensor under this contact; NaN until the noise is known."""
     rest_sigma: Array
-    """(6,) sigma of the mean for a free tool."""
+    """(6,) sigma of `wrench` for a tool without contact; NaN until the noise is known."""
     sample_sigma: Array
-    """(6,) sigma of one sample for a free tool."""
+    """(6,) sigma of the wrench of a single sample for a tool without contact; NaN until the noise is known."""
     chi2: float
-    """Squared Mahalanobis distance of the newest sample from the wrench of a free tool."""
+    """Squared Mahalanobis distance of the newest sample's wrench from that of a tool without contact."""
     in_contact: bool
     R_base_flange: Array
     p_base_flange_m: Array
@@ -74,20 +74,20 @@ class ShownWrench:
     stages: Stages
 
     def size(self, first: int) -> tuple[float, float]:
-        """Return the norm of the force (`first` 0) or the torque (3), and the sigma along its direction."""
+        """Return the norm of the force (`first` is 0) or the torque (3), and the sigma along its direction."""
         part, sigma = self.wrench[first : first + 3], self.sigma[first : first + 3]
         size = float(np.linalg.norm(part))
         return size, float(np.linalg.norm(part * sigma)) / size if size else float(sigma.max())
 
     def is_significant(self, first: int) -> bool:
-        """Whether the force (`first` 0) or the torque (3) exceeds the noise; False until the noise is known."""
+        """Whether the force (`first` is 0) or the torque (3) exceeds 4 sigma; False until the noise is known."""
         size, sigma = self.size(first)
         return size > _SIGNIFICANT * sigma
 
 
 @dataclass(slots=True, eq=False)
 class Peaks:
-    """Extremes of the wrench since the last reset."""
+    """Smallest and largest values of the wrench since the last reset; `low` > `high` without samples."""
 
     low: Array = field(default_factory=lambda: np.full(6, np.inf))
     high: Array = field(default_factory=lambda: np.full(6, -np.inf))
@@ -95,7 +95,7 @@ class Peaks:
     """(2,) largest norms of force and torque, N and N·m."""
 
     def add(self, wrench: Array) -> None:
-        """Add samples (n, 6)."""
+        """Extend the extremes by the wrenches (n, 6) of samples."""
         np.minimum(self.low, wrench.min(axis=0), out=self.low)
         np.maximum(self.high, wrench.max(axis=0), out=self.high)
         np.maximum(self.sizes, np.linalg.norm(wrench.reshape(-1, 2, 3), axis=2).max(axis=0), out=self.sizes)
@@ -103,39 +103,39 @@ class Peaks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """The state of a stream to show."""
+    """The state of a stream, as screens and pages show it."""
 
     info: StreamInfo
     status: StreamStatus
     reading: ShownWrench | None
-    """Newest mean; None before the first sample."""
+    """The newest mean wrench; None before the first sample."""
     silent: str
-    """The device without new samples, and what to do; empty while samples arrive."""
+    """Text that names the device without new samples and what is wrong; empty while samples arrive."""
     peaks: Peaks
     contact_s: float
     """Duration of the current contact, s."""
     notes: Sequence[FeedNote]
-    """Notes, newest first."""
+    """Notes about events of the stream, the newest first."""
     checks: Sequence[Check]
     columns: Callable[[int], PlotColumns]
-    """Function that returns the recent past, divided into the given number of columns."""
+    """Function that returns the recent wrench for plots, divided into the given number of columns."""
     recording_s: float | None
-    """Duration of the recording, s; None if none is running."""
+    """Duration of the current recording to a file, s; None if nothing is being recorded."""
     is_frozen: bool = False
     can_push: bool = False
-    """Whether a key can push the tool, which only an emulated cell allows."""
+    """Whether a key can push the emulated tool; False for a real cell."""
     replay: RecordingSource | None = None
     calibrated: Array | None = None
-    """(n, 3) unit vectors of gravity in flange axes at the calibrated orientations; None if unknown."""
+    """(n, 3) unit vectors of gravity in flange axes at the poses of the calibration; None if these are unknown."""
 
     @property
     def live(self) -> ShownWrench | None:
-        """The newest mean; None while a device sends no samples, because an old value must not look current."""
+        """The newest mean wrench; None while a device sends no samples, because an old value must not look current."""
         return None if self.silent else self.reading
 
     @property
     def used_range(self) -> tuple[float, str] | None:
-        """Largest used share of the sensor's range, and its axis; None without a known range or without samples."""
+        """Largest fraction of the sensor's range in use, and on which axis; None if range or wrench are unknown."""
         fact = self.info.sensor.facts.get("range")
         if fact is None or not isinstance(fact.value, tuple) or self.reading is None:
             return None
@@ -158,7 +158,7 @@ class View:
         return f"{reading.t_host_ns * 1e-9:.1f} s   {line}{contact}" if timed else line
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the state as JSON; the wrenches are null while a device sends no samples."""
+        """Return the state of the stream as JSON; all wrenches are null while a device sends no samples."""
         status, calibration, verification = self.status, self.info.result, self.info.verification
         reading, is_raw = self.reading, self.info.is_raw
         assert reading is not None  # noqa: S101 - there is one from the first sample on
@@ -193,9 +193,9 @@ class View:
 
 
 class StreamSummary:
-    """Summarises the data from a `Feed`, and the `checks` to show.
+    """Collects what a `Feed` reads, and the findings `checks`, into a `View` to show.
 
-    The noise at rest is compared with that in `dataset`, which has the poses of the calibration.
+    If the `dataset` of the calibration is given, the stream's noise at rest is compared with the noise in it.
     """
 
     def __init__(self, feed: Feed, checks: Sequence[Check] = (), dataset: CalibrationDataset | None = None) -> None:
@@ -205,7 +205,7 @@ class StreamSummary:
         self._new_blocks, self._new_notes = feed.subscribe()
         self._found, self._checks = deque(checks), list[Check]()
         self._histories = {span_s: History(span_s) for span_s in SPANS_S}
-        # The samples in the newest mean.
+        # samples of the last 0.1 s, for the mean
         self._recent: Block | None = None
         self._peaks = Peaks()
         self._contact_since_ns = 0
@@ -216,11 +216,11 @@ class StreamSummary:
             self._calibrated = feed.stream.info.calibration.parameters.down @ dataset.R_base_flange
 
     def reset_peaks(self) -> None:
-        """Reset the extremes."""
+        """Forget the smallest and largest values of the wrench so far."""
         self._peaks = Peaks()
 
     def view(self) -> View:
-        """Take the new blocks and notes, and return the state to show."""
+        """Take the new samples and notes of the feed, and return the state of the stream to show."""
         feed = self._feed
         while self._found:
             self._checks.append(check := self._found.popleft())
@@ -275,7 +275,7 @@ class StreamSummary:
                     yield view
 
     def lines(self, *, once: bool, as_json: bool) -> Iterator[str]:
-        """Yield each of the `views` as a line or a JSON object; with `once`, only the first."""
+        """Yield the stream's `views` as lines of text or JSON; with `once`, only the first."""
         for view in islice(self.views(raises=once), 1 if once else None):
             yield json.dumps(view.to_dict()) if as_json else view.in_line(timed=not once)
 
@@ -330,7 +330,7 @@ class StreamSummary:
                 for history in self._histories.values():
                     history.clear()
         rows = Block.concatenate([before, block]) if before is not None and goes_on else block
-        # After a jump back in a recording, samples read earlier have later times.
+        # drop later times too: after a jump back in a recording, samples read earlier have them
         since_ns = t_ns[-1] - round(MEAN_S * 1e9)
         self._recent = rows.rows((since_ns < rows.t_host_ns) & (rows.t_host_ns <= t_ns[-1]))
         self._peaks.add(block.wrench)
@@ -342,7 +342,7 @@ class StreamSummary:
 
 
 def state(view: View) -> tuple[str, str]:
-    """Return the contact state of a stream, and a text about its contact test."""
+    """Return the contact state of a stream, such as "contact", and a text with the value and limit of its test."""
     if (reading := view.reading) is None:
         return WAITING, ""
     if np.isnan(reading.chi2) or view.status.contact_limit > _MOST_CHI2:
@@ -352,7 +352,7 @@ def state(view: View) -> tuple[str, str]:
 
 
 def wrench_meaning(view: View) -> str:
-    """Return what the wrench still contains after the stages; empty before the first sample."""
+    """Return what the shown wrench is, by the stages in use, such as "weight included"; empty before a sample."""
     if view.reading is None:
         return ""
     stages = view.reading.stages
@@ -364,13 +364,13 @@ def wrench_meaning(view: View) -> str:
 
 
 def name_devices(info: StreamInfo) -> str:
-    """Return the names of arm, sensor and tool."""
+    """Return a text that names the arm's model, the sensor with its serial number, and the tool."""
     serial = "" if info.sensor.serial == NOT_REPORTED else f" {info.sensor.serial}"
     return " · ".join(filter(None, [info.arm.model, info.sensor.model + serial, info.tool]))
 
 
 def short_frame(frame: WrenchFrame) -> str:
-    """Return axes and reference point, such as "base @ tcp"."""
+    """Return a frame's axes and reference point as a short text, such as "base @ tcp"."""
     return f"{frame.axes} @ {_point_name(frame)}"
 
 
@@ -381,7 +381,7 @@ def _point_name(frame: WrenchFrame) -> str:
 
 
 def direction_text(reading: ShownWrench, first: int) -> str:
-    """Return the direction of the force (`first` 0) or the axis of the torque (3); empty if it may be noise."""
+    """Return a text with the direction of the force (`first` is 0) or torque (3); empty if it may be noise."""
     if not reading.is_significant(first):
         return ""
     axes, vector = str(reading.frame).partition(", ")[0], reading.wrench[first : first + 3]
@@ -390,7 +390,7 @@ def direction_text(reading: ShownWrench, first: int) -> str:
 
 
 def line_of_force(reading: ShownWrench | None) -> str:
-    """Return where the contact force's line of action passes the reference point; empty if it may be noise."""
+    """Return how far from the reference point the contact force's line of action is; empty if it may be noise."""
     if reading is None or not reading.in_contact or not reading.is_significant(0):
         return ""
     force, torque = reading.wrench[:3], reading.wrench[3:]
@@ -407,12 +407,12 @@ def _utc(info: StreamInfo, t_host_ns: int) -> datetime:
 
 
 def time_of_day(info: StreamInfo, t_host_ns: int) -> str:
-    """Return a time in the stream as the local time of day."""
+    """Return a time on the clock of the stream as the local time of day, HH:MM:SS."""
     return _utc(info, t_host_ns).astimezone().strftime("%H:%M:%S")
 
 
 def calibration_in_words(view: View) -> list[tuple[str, str]]:
-    """Return the calibration's id, verdict, age and last verification, each with "good", "warning", "bad" or ""."""
+    """Return texts with the calibration's id, verdict, age and last verification, each with a tone such as "good"."""
     calibration, found = view.info.result, view.info.verification
     if calibration is None:
         return [("sensor alone: no arm, no calibration", "warning")]
@@ -428,7 +428,7 @@ def calibration_in_words(view: View) -> list[tuple[str, str]]:
 
 
 def bias_in_words(view: View) -> list[str]:
-    """Return texts about the tare, and about the drift or the tracked bias and part."""
+    """Return texts about the tare, and about the drift of the bias or, if it is tracked, the bias and the part."""
     status, words = view.status, list[str]()
     if status.tare is not None and status.tare_t_host_ns is not None:
         force_N = float(np.linalg.norm(status.tare[:3]))
@@ -444,12 +444,12 @@ def bias_in_words(view: View) -> list[str]:
 
 
 def link_in_words(view: View, link: LinkStatus) -> tuple[str, str, str, str]:
-    """Return rate, losses and age of a device's samples, and for the arm also the delay of the wrench."""
+    """Return texts with rate, losses and age of a device's samples, and the wrench's delay (empty for the sensor)."""
     nominal = "" if np.isnan(link.nominal_rate_Hz) else f" of {link.nominal_rate_Hz:.0f}"
     age = f"{1e3 * link.age_s:.0f} ms" if link.age_s < 1 else f"{link.age_s:.1f} s"
     sigma_s, delay = view.status.delay_sigma_s, f"delay {1e3 * view.status.delay_s:.1f}"
     delay += f" ± {1e3 * sigma_s:.1f} ms" if sigma_s else " ms, set"
-    if link is view.status.sensor or view.replay is not None:  # a recording is already aligned
+    if link is view.status.sensor or view.replay is not None:  # recordings are already aligned
         delay = ""
     elif sigma_s >= _MEASURED_S:
         delay = "delay not measured yet"
@@ -457,7 +457,7 @@ def link_in_words(view: View, link: LinkStatus) -> tuple[str, str, str, str]:
 
 
 def other_wrenches(view: View) -> list[tuple[str, Array | None]]:
-    """Return the wrench after fewer stages and in other frames; None where a frame needs a missing setting."""
+    """Return named wrenches: after only some stages, and in other frames; None if a frame needs a missing setting."""
     if (reading := view.reading) is None or view.info.is_raw:
         return []
     calibration, raw, R, now = view.info.calibration, reading.raw, reading.R_base_flange, reading.frame
@@ -475,7 +475,7 @@ def other_wrenches(view: View) -> list[tuple[str, Array | None]]:
 
 
 def full_scale(columns: PlotColumns, reading: ShownWrench | None, first: int) -> float:
-    """Return a round full scale for three components that covers the recent extremes and keeps the noise small."""
+    """Return a round full scale for plots of force (`first` is 0) or torque (3): above the extremes and 10 sigma."""
     rows = slice(first, first + 3)
     largest = np.abs([columns.low[rows], columns.high[rows]])
     sigma = np.zeros(3) if reading is None else np.nan_to_num(reading.sample_sigma[rows])
@@ -488,18 +488,18 @@ def full_scale(columns: PlotColumns, reading: ShownWrench | None, first: int) ->
 # -- the screen and page of a scale
 
 NO_MASS = "- - -"
-# If the smallest detectable mass exceeds this, kg, the drift since the calibration is the cause, and zeroing helps.
+# A smallest detectable mass above this, kg, is due to the bias's drift since the calibration, so zeroing helps.
 _UNZEROED_KG = 0.1
 
 
 def worth_of(weight: Weight) -> str:
-    """Return a text with the sigma and the smallest detectable mass of a weight."""
+    """Return a text with the sigma of a weighed mass and the smallest mass that could be detected."""
     sigma_g, least_g = (to_place_of(1e3 * kg, 1e3 * kg) for kg in (weight.mass_sigma_kg, weight.least_kg))
     return f"sigma {sigma_g} g, smallest mass {least_g} g"
 
 
 def zero_in_words(weighing: Weighing) -> tuple[str, bool]:
-    """Return the age of the zero, and whether zeroing again would help; empty if the bias is tracked."""
+    """Return a text with the time since the last zero, and whether zeroing would help; empty if the bias is tracked."""
     if weighing.moving:
         return "", False
     zeroed_s, weight = weighing.stream.processor.monitor.reference()[1], weighing.shown.measured

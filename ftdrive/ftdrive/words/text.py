@@ -43,10 +43,10 @@ GLUE: Final = "\ue000"
 
 
 def as_typed(text: str) -> str:
-    """Return a message with `uv run` before its commands if this program was started by `uv run`."""
+    """Return a message whose commands begin with `uv run` if `uv run` has started this program."""
     return (
         _COMMAND.sub("uv run ftdrive ", text) if "UV_RUN_RECURSION_DEPTH" in os.environ else text
-    )  # uv run sets this variable
+    )  # set by `uv run`
 
 
 def is_command(line: str) -> bool:
@@ -54,7 +54,7 @@ def is_command(line: str) -> bool:
     return line.startswith(("ftdrive ", "uv run ftdrive "))
 
 
-# Control characters except tab and newline, characters that change the writing direction, and undecodable bytes.
+# Characters to escape: controls except tab and newline, changes of the writing direction, undecodable bytes.
 _CONTROL = re.compile(
     "[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]|\r(?!\n)"
 )
