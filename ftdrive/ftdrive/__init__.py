@@ -18,7 +18,7 @@ Two packages come with it. `ftcalib` has the parts of the solver, such as `Param
 
 from importlib import import_module
 
-TYPE_CHECKING = False  # as in `typing`, which would take most of the import time
+TYPE_CHECKING = False  # type checkers take it as true; importing it from `typing` would take most of the import time
 if TYPE_CHECKING:
     from ftcalib.compare import compare
     from ftcalib.data.dataset import CalibrationDataset

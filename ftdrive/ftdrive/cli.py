@@ -1,4 +1,4 @@
-"""The command line: one group with lazily imported commands, and the output of errors."""
+"""The command line `ftdrive`: its commands, imported only when called, and the output of errors."""
 
 import atexit
 import gc
@@ -28,12 +28,12 @@ Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device
 141 the reader of the output has ended."""
 
 
-# click reads this class attribute for every command.
+# Format of all help texts: click reads this class attribute for every command.
 click.Context.formatter_class = WholeWords
 
-# Exit code that shells report for a program that SIGPIPE ended.
+# Exit code that a shell reports for a program ended by SIGPIPE, whose output lost its reader.
 _CLOSED_PIPE = 128 + 13
-# Hang-up signals received because the terminal was closed; errors after them are a consequence.
+# Signals received because the terminal was closed. Errors after such a signal are its consequence.
 _closed_terminals: list[int] = []
 
 
@@ -52,7 +52,7 @@ def _closed_pipe() -> Iterator[None]:
 class _LazyGroup(click.Group):
     """A group whose commands are imported only when called: `modules` maps each name to its module and help line.
 
-    For a mistyped command, the most similar name is proposed.
+    The error message for a mistyped command proposes the most similar name.
     """
 
     def __init__(self, *args: Any, modules: Mapping[str, tuple[str, str]], **options: Any) -> None:
@@ -171,9 +171,9 @@ def _hang_up(number: int, frame: FrameType | None) -> None:
 
 
 def _leave_dead_streams() -> bool:
-    """Redirect standard streams without a reader to /dev/null, because Python flushes them at exit.
+    """Redirect stdout and stderr to /dev/null if their reader has ended, because Python flushes them at exit.
 
-    Return whether standard output had no reader.
+    Return whether stdout had lost its reader.
     """
     dead = []
     for stream in (sys.stdout, sys.stderr):
@@ -187,21 +187,21 @@ def _leave_dead_streams() -> bool:
 
 
 def _open_closed_streams() -> None:
-    """Open /dev/null for standard streams that the caller closed, so that no other file gets their descriptors."""
+    """Open /dev/null as each standard stream that the caller closed, so that no file gets its descriptor later."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command line without the program's name; print errors, and return the exit code."""
+    """Run a command line, given without the program's name; print its error, if any, and return the exit code."""
     try:
         code = _run(arguments)
     except Exception:
         if not _closed_terminals:
             raise
         code = 1
-    if _closed_terminals:  # this is the cause of any other error
+    if _closed_terminals:  # the cause of other errors
         _say("error: the terminal was closed")
         return exit_code(SupervisorGone("")) or code
     return code
@@ -220,7 +220,7 @@ def _run(arguments: Sequence[str]) -> int:
         code = exit_code(error)
         if code is None or _closed_terminals:
             raise
-        # a file of the wrong kind may be the cause of the error
+        # if a file of the wrong kind may be the cause, name the command that accepts it
         about = str(error) if isinstance(error, UsageError) else ""
         other = _other_command(arguments, about) if isinstance(error, DataError | UsageError | OSError) else ""
         _say(f"error: {in_one_line(other or in_a_sentence(error))}")

@@ -10,15 +10,15 @@ from ftdrivers.errors import ConnectError, DeviceFault
 
 
 class ConfigError(UsageError):
-    """The configuration or the combination of options is not usable."""
+    """The configuration of the cell or the combination of options is not usable."""
 
 
 class BadPlan(DataError):
-    """A file does not contain a valid plan."""
+    """A file does not contain a valid plan of a tour or sweep."""
 
 
 class BadRecording(DataError):
-    """A file does not contain a recording that this version can read; the message begins with its path."""
+    """A file does not contain a recording that this version can read. If known, its path begins the message."""
 
     def __init__(self, problem: str, path: Path | None = None) -> None:
         super().__init__(problem if path is None else f"{path}: {problem}")
@@ -38,7 +38,7 @@ class RecordingHasGaps(DataError):
 
 
 class NotAccepted(AcceptanceError):
-    """A check failed, or a result is rejected or differs from the expected one."""
+    """A check has failed, a result is rejected, or it differs from the expected one."""
 
 
 class PlanRefused(NotAccepted):
@@ -50,16 +50,16 @@ class Declined(FtdriveError):
 
 
 class SupervisorGone(FtdriveError):
-    """The operator, or the program in their place, no longer follows the session.
+    """The operator, or the program that answers in their place, no longer follows the session.
 
-    `why` names what was closed, `effect` the consequence and the remedy.
+    `why` states what was closed, such as the terminal; `effect` states the consequence and what to do.
     """
 
     def __init__(self, why: str, effect: str = "the session ends with the arm at rest; continue with --resume") -> None:
         super().__init__(f"{why}: {effect}")
 
 
-# The first class that matches determines the code.
+# Exit codes by class of error. The first class that matches an error determines its code.
 _EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (UsageError, 2),
     (ConnectError, 3),
@@ -77,12 +77,12 @@ _EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
 def exit_code(error: BaseException) -> int | None:
     """Return the exit code of an error that a user can fix; None for a defect of ftdrive."""
     if isinstance(error, ModuleNotFoundError) and error.name in sys.stdlib_module_names:
-        return 2  # a module that this system lacks, such as `termios` on Windows
+        return 2  # a module of Python that this system lacks, as Windows lacks `termios`
     return next((code for kind, code in _EXIT_CODES if isinstance(error, kind)), None)
 
 
 def in_a_sentence(error: BaseException) -> str:
-    """Return the message of an error; for an operating-system error, add the file and what to check."""
+    """Return an error's message; for one of the operating system or a missing module, add file and what to do."""
     if isinstance(error, ModuleNotFoundError):
         return f"Python on {platform.system()} has no module {error.name}, which is needed here: use Linux"
     if isinstance(error, OSError) and error.filename is not None:

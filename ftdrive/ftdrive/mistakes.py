@@ -1,4 +1,4 @@
-"""Suggestions for a command line that cannot run: another command for this file, or an existing name."""
+"""Suggestions for a command line that cannot run: another command for a given file, an existing name, a full line."""
 
 import re
 import shlex
@@ -15,17 +15,17 @@ from ftdrive.runs import is_run
 
 
 class Kind(NamedTuple):
-    """A kind of file, with the commands and options that accept it."""
+    """A kind of file or folder, such as a run, with the commands and options that accept it."""
 
     words: str
     lines: tuple[str, ...]
-    """The usual commands for such a file, as typed."""
+    """The usual commands for this kind of file, as typed, with {} for the path."""
     others: tuple[str, ...] = ()
-    """Other commands that accept such a file."""
+    """Other commands that accept this kind of file, with {} for the path."""
 
     @property
     def places(self) -> set[str]:
-        """Where such a file may be given: options, and commands that take it as an argument."""
+        """Names of the options that accept this kind of file, and of the commands that take it as an argument."""
         heads = (line.partition(" {}")[0] for line in (*self.lines, *self.others))
         return {head.rpartition(" ")[2] if " --" in head else head for head in heads}
 
@@ -84,7 +84,7 @@ _ALIKE = 0.75
 
 
 def kind_of(path: Path) -> str | None:
-    """Return the kind of a file or folder, from its first bytes and its suffix; None if no command accepts it."""
+    """Return the kind of a file or folder, a key of `KINDS`, by content and suffix; None if no command accepts it."""
     from ftdrive.recording.foreign import is_bag, is_recording
 
     with suppress(OSError):
@@ -114,9 +114,9 @@ def _runs_in(folder: Path) -> Iterator[Path]:
 
 
 def other_command(group: click.Group, arguments: Sequence[str], about: str = "") -> str:
-    """Return the commands for the first file that this command does not accept; empty if there is none.
+    """Return a message with commands for the first given file that is not accepted where it is; empty if there is none.
 
-    With the error message `about`, only files that it names are considered.
+    If `about`, an error message, is not empty, only files that it names are considered.
     """
     for number, place, name, command in _unmatched_arguments(group, arguments):
         path, kind = Path(name), kind_of(Path(name))
@@ -131,7 +131,7 @@ def other_command(group: click.Group, arguments: Sequence[str], about: str = "")
         if " " in place:
             own += [line for line in (*KINDS[kind].lines, *KINDS[kind].others) if line.split()[0] == place.split()[0]]
         lines = [f"ftdrive {line.format(shlex.quote(str(path)))}" for line in dict.fromkeys([*own, *KINDS[kind].lines])]
-        # another command or option accepts this file, or this one accepts another file
+        # propose other commands for this file, or, for a folder of runs or a file in a run, this line with the run
         better = path if path != Path(name) else next(_runs_in(path), None) if kind == "runs" else None
         if better is not None:
             given = arguments[number].removesuffix(name) + str(better)
@@ -143,7 +143,7 @@ def other_command(group: click.Group, arguments: Sequence[str], about: str = "")
 
 
 def _unmatched_arguments(group: click.Group, arguments: Sequence[str]) -> Iterator[tuple[int, str, str, click.Command]]:
-    """Yield number, place, name and command for each argument that is an input file, or that no command expects."""
+    """Yield index, option or command words, text and command of each argument that is an input file or unexpected."""
     command: click.Command = group
     words, option, number_of_place = list[str](), "", 0
     for number, argument in enumerate(arguments):
@@ -175,7 +175,7 @@ def _is_read(parameter: click.Parameter) -> bool:
 
 
 def similar_path(group: click.Group, arguments: Sequence[str]) -> str:
-    """Return a sentence with a path similar to the missing one, or with how to find one."""
+    """Return a question that proposes a path similar to a missing one, or how to find one; empty if there is none."""
     for _, _, name, _ in _unmatched_arguments(group, arguments):
         path = Path(name)
         if path.exists():
@@ -183,7 +183,7 @@ def similar_path(group: click.Group, arguments: Sequence[str]) -> str:
         with suppress(OSError):
             if found := get_close_matches(path.name, [one.name for one in path.parent.iterdir()], 1, _ALIKE):
                 return _question([str(path.with_name(found[0]))])
-        # not for plans, tables or lists of cells, which `history` does not list
+        # by the suffix of runs and results, because `history` lists no plans, tables or lists of cells
         return " `ftdrive history` lists your runs." if path.suffix in {"", ".json"} else ""
     return ""
 
@@ -199,13 +199,13 @@ def _question(names: Iterable[str]) -> str:
 
 
 def missing_parameters(error: click.MissingParameter, arguments: Sequence[str]) -> str:
-    """Return a message with all missing parameters, of which `click` names only the first, and the complete line."""
+    """Return a message that names all missing parameters (`click` names only the first), with the complete line."""
     context = error.ctx
     if context is None or context.info_name not in arguments:
         return error.format_message()
     command, typed = context.command, list(arguments[arguments.index(context.info_name) + 1 :])
     given, _, _ = command.make_parser(context).parse_args(list(typed))
-    # the value of a missing parameter depends on the `click` version, but is never text
+    # a missing parameter is one whose value is no text or list, because its value depends on the version of `click`
     absent = [
         one for one in command.params if one.required and not isinstance(given.get(one.name or ""), str | tuple | list)
     ]
@@ -219,7 +219,7 @@ def missing_parameters(error: click.MissingParameter, arguments: Sequence[str]) 
 
 
 def without_value(error: click.BadOptionUsage, group: click.Group, arguments: Sequence[str]) -> str:
-    """Return the error, and the line with a placeholder after the option that lacks its value."""
+    """Return the message of an error about an option without a value, and the line with a placeholder for the value."""
     command: click.Command = group
     words = ["ftdrive"]
     for argument in arguments:
@@ -233,11 +233,11 @@ def without_value(error: click.BadOptionUsage, group: click.Group, arguments: Se
 
 
 def of_subcommand(error: click.NoSuchOption, arguments: Sequence[str]) -> str:
-    """Return the error and the line with the option after the subcommand that has it, or only the error."""
+    """Return the message about an unknown option, and if a subcommand has the option, the line with it there."""
     context = error.ctx
     if context is not None and isinstance(group := context.command, click.Group):
         names = group.list_commands(context)
-        # only among subcommands, because importing all commands takes a second
+        # if no subcommand was typed, search all of them only in a subgroup, because importing all commands takes 1 s
         for name in [one for one in names if one in arguments] or (names if context.parent else []):
             command = group.get_command(context, name)
             if command is not None and any(error.option_name in one.opts for one in command.params):

@@ -1,1 +1,1 @@
-"""Commands of the application, one module each, imported only when called."""
+"""Commands of `ftdrive`, one module each, which is imported only when its command is called."""

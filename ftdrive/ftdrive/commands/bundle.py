@@ -1,4 +1,4 @@
-"""`ftdrive bundle`: a run in one file for a bug report, without addresses and names."""
+"""`ftdrive bundle`: write a run into one file for a bug report, without addresses and names."""
 
 from contextlib import nullcontext
 from pathlib import Path

@@ -160,10 +160,10 @@ def calibrate_command(
         page = stack.enter_context(view.page("ftdrive calibrate"))
         header = {} if options.resume is None else Run(options.resume).header_to_resume()
         made_by = header.get("station")
-        # A resumed run keeps its cell, emulated or real.
+        # A run of an emulated cell is resumed in an emulated one, unless an option describes a real cell.
         simulate = simulate or bool(made_by and not (described.config or described.robot or tool))
         if simulate:
-            # A hanging load needs real time to stop swinging.
+            # A hanging load needs real time to stop swinging, so the emulated arm is not sped up.
             swings = load is not None and not load.gripped
             pace = REAL_PACE if options.mode in ("sweep", "passive") or swings else ()
             station = stack.enter_context(Station.of(made_by, described.sensor, pace, control_path=control))
@@ -250,7 +250,7 @@ def _given_options(context: click.Context) -> dict[str, Any]:
 
 
 def refuse_contradictions(given: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` if given options exclude one another; `given` has their values by name."""
+    """Raise `ConfigError` if options of `calibrate` contradict each other; `given` maps those given to values."""
     if "--load" not in given and (place := [option for option in ("--at", "--gripped") if option in given]):
         raise ConfigError(f"{place[0]} needs --load MASS: give the mass of the load in kg")
     for group in _EXCLUDE_ONE_ANOTHER:

@@ -1,4 +1,4 @@
-"""`ftdrive config`: the values in use, and the origin of each."""
+"""`ftdrive config`: show the configuration in use, and the origin of each value."""
 
 import sys
 from dataclasses import replace

@@ -74,7 +74,7 @@ def _serial_port(port: ListPortInfo) -> dict[str, Any]:
 
 
 def _probe_place(place: str, clock: Clock, failures: list[Exception]) -> list[dict[str, Any]]:
-    """Probe one place. An error is added to `failures` and to the result, so that the other places are still probed."""
+    """Probe one port or bus for sensors. An error is added to `failures` and the result, so that others are probed."""
     nothing = {"port": place, "url": None, "what": "no known sensor answers", "error": None}
     try:
         answers = [nothing | {"url": answer.url, "what": answer.what} for answer in probe_place(place, clock)]

@@ -35,7 +35,7 @@ class _Side(NamedTuple):
     created_utc: str | None
     mass_kg: float
     mass_sigma_kg: float
-    # Whether the calibration was made in an emulated cell.
+    # whether the calibration was made in an emulated cell
     emulated: bool
 
 
@@ -113,9 +113,9 @@ def _side(text: str) -> _Side:
 
 
 def _sensors(a: _Side, b: _Side) -> tuple[str, str] | None:
-    """Return where the sensor errors under contact come from in A and B; None if they are equal or unknown."""
+    """Return texts about the sensor errors under contact in A and in B; None if they are equal or unknown."""
     first, second = a.calibrated, b.calibrated
-    # A result from the store has no sensor matrix.
+    # a result from the store has no sensor matrix, so its errors under contact are unknown
     if not (isinstance(first, CalibrationResult) and isinstance(second, CalibrationResult)):
         return None
     if first.contact.sensor.to_dict() == second.contact.sensor.to_dict():

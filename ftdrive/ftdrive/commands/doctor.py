@@ -37,7 +37,7 @@ from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import answer, indented, messages, working
 from ftdrive.terminal.text import echo
 
-# Checks that the summary shows for robot, sensor and noise; for other subjects, it shows the first that passed.
+# Names of the checks by which the summary stands for robot, sensor and noise; for others, it is the first passed one.
 _HEADLINES = ("robot.identity", "sensor.identity", "noise.accuracy")
 _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "red"), "skipped": ("-", "")}
 
@@ -146,7 +146,7 @@ def _print_checks(found: list[Check], *, every: bool) -> None:
 
 
 def _attention_only(checks: list[Check]) -> list[Check]:
-    """Return the checks that need attention, after one that identifies the subject and counts the passed checks."""
+    """Return one check that identifies the subject and counts the passed ones, then those that need attention."""
     passed = [check for check in checks if check.state == "ok"]
     first = [check for check in passed if check.name in _HEADLINES][:1] or passed[:1] or checks[:1]
     if first[0].state == "ok" and len(passed) > 2:

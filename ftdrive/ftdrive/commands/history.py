@@ -19,13 +19,13 @@ from ftdrive.terminal.console import answer, indented, messages
 from ftdrive.terminal.text import echo, print_table
 from ftdrive.words.history import DAY_TITLES, day_row, last_weighing_in_words, result_table, temperature_lines
 
-# Fewer records cannot make three pairs of runs, so numpy, whose import takes as long as the rest, is not imported.
+# Fewer runs cannot make three pairs, so trends of the bias are skipped, and numpy, which is slow, is not imported.
 _FEWEST_RUNS = 4
 _HOUR = "bias, {sensor_serial}: changes by {force_N:.2g} N, {torque_Nm:.2g} N·m per axis within an hour (1 sigma)"
 _MOUNTED = ("sensor_serial", "arm_serial", "mount")
-# Largest number of days with weighings in the list.
+# Largest number of days with weighings that are listed.
 _MOST_DAYS = 20
-# Weighings older than this are not shown as the last ones.
+# The last weighings are shown only if they are younger than this.
 _RECENT = timedelta(days=90)
 
 

@@ -77,7 +77,7 @@ def init(output: Path, simulate: bool, yes: bool, view: ViewOptions, as_json: bo
     check_simulate(simulate, real={"--robot": given["robot"]})
     in_force = {key: setting.value for key, setting in settings().items()}
     described = Description(clock_in_force(), in_force, simulate=simulate)
-    # The draft keeps the answers until the configuration file is written.
+    # The draft file keeps the answers until the configuration file is written.
     draft = output.with_name(f".{output.name}.draft")
     again = "ftdrive init" + ("" if str(output) == "ftdrive.toml" else f" -o {quote(str(output))}")
     interview = Interview(described, None if yes else draft, again + " --simulate" * simulate)
@@ -89,7 +89,7 @@ def init(output: Path, simulate: bool, yes: bool, view: ViewOptions, as_json: bo
                 described.clock = station.clock
                 interview.look(ROBOT, station.cell.robot.host)
                 interview.look(SENSOR, station.cell.sensor.url)
-            # The addresses of the station are valid only while it runs.
+            # store addresses that stay valid: those of the emulated devices exist only while they run
             described.texts |= {ROBOT: ["emulated"], SENSOR: [EMULATED + emulated]}
         interview.take_options(given)
         if page is None:

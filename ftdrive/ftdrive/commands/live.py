@@ -123,13 +123,13 @@ def live(
             checks = [check_weighed_payload(payload_kg, stream.info.calibration, mass_kg)]
             recorder = lambda path: Recorder([path], stream.info, stream.cell.to_dict())  # noqa: E731
         feed = Feed(stream, recorder)
-        if source.simulate:  # N and N·m, in sensor axes
+        if source.simulate:  # push by a wrench in sensor axes
             feed.push = partial(stream.station.control, do="push", wrench=[0.0, 0.0, -8.0, 0.0, 0.0, 0.0], seconds=1.0)
         title = "ftdrive live" if replay is None else f"ftdrive live, replay of {replay.name}"
         if (page := stack.enter_context(view.page(title))) is not None:
             certifier = certifier_of(stream, replay, messages.print)
             shown = LivePage(page, feed, checks, certifier, controls=allow_control)
-            # the full screen would hide printed messages
+            # on the full screen, errors of the page become notes, because it would hide printed messages
             say = partial(feed.note, kind="failed") if full_screen else messages.print
             stack.enter_context(drawing(page, shown.draw, say))
         if full_screen:

@@ -34,14 +34,14 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Headed(click.Command):
-    """A command whose help lists its options under headings: `headings` maps each heading to option names."""
+    """A command whose help groups the options: `headings` maps each heading to the names of its options."""
 
     def __init__(self, *args: Any, headings: Mapping[str, str], **options: Any) -> None:
         super().__init__(*args, **options)
         self.headings = headings
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the options."""
+        """Write the options under their headings."""
         options = {name: one for one in self.get_params(ctx) for name in one.opts}
         for heading, names in self.headings.items():
             with formatter.section(heading):
@@ -49,7 +49,7 @@ class Headed(click.Command):
 
 
 def _combined(*options: Callable[[F], F]) -> Callable[[F], F]:
-    """Return one decorator for several options, in the order of the help."""
+    """Combine the decorators of several options, given in the order of the help, into one."""
 
     def added(command: F) -> F:
         for option in reversed(options):
@@ -82,7 +82,7 @@ CONTROL = click.option(
 
 
 def runs_option(words: str = "Parent folder of the new run folder.") -> Callable[[F], F]:
-    """Return the option --runs."""
+    """Return the option --runs with the help text `words`."""
     folder = click.Path(file_okay=False, path_type=Path)
     return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
 
@@ -129,12 +129,12 @@ class CellOptions:
     robot: str | None = None
     sensor: str | None = None
     tool: tuple[str, ...] = ()
-    """Cylinders around the tool and the sensor."""
+    """Texts of the options --tool, each a cylinder around the tool or the sensor."""
     control: str | None = None
     model: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the options to store in run.json."""
+        """Return the options that run.json stores, so that a resumed run can use them."""
         kept = ("config", "robot", "sensor", "tool", "control")
         return {name: getattr(self, name) for name in kept} | {"config": self.config and str(self.config)}
 
@@ -150,7 +150,7 @@ class CellOptions:
         )
 
     def settings(self) -> dict[str, Setting]:
-        """Return the settings from options, environment and files, in order of priority; see `cell.config.settings`."""
+        """Return each setting from options, else the environment, else a file; see `ftdrive.cell.config.settings`."""
         flags = {
             "robot.host": ("--robot", self.robot),
             "robot.model": ("--model", self.model),
@@ -161,24 +161,24 @@ class CellOptions:
         return settings(self.config, flags)
 
     def cell(self, *, sensor_alone: bool = False) -> CellConfig:
-        """Return the cell. With `sensor_alone`, no robot is needed if --sensor is given; the host may then be empty."""
+        """Return the described cell. With `sensor_alone` and --sensor, a robot is optional; its host may be empty."""
         values = self.settings()
         needs_robot = not sensor_alone or self.sensor is None or values["robot.host"].value is not None
         return cell_of(values, devices=needs_robot)
 
     def sensor_alone(self) -> CellConfig:
-        """Return a cell with only a sensor; no settings of the arm are required."""
+        """Return a cell whose settings of the arm may be missing. Raises `ConfigError` if no sensor is given."""
         cell = cell_of(self.settings(), devices=False)
         if not cell.sensor.url:
             raise ConfigError("no sensor: give --sensor URL, or --simulate; see `ftdrive devices --probe PLACE`")
         return cell
 
     def cell_to_resume(self, folder: Path, header: Mapping[str, Any], say: Callable[[str], object]) -> CellConfig:
-        """Return the cell of a resumed run with this header; options given now replace those of the run.
+        """Return the cell for resuming a run, whose run.json is `header`; options given now replace those of the run.
 
-        Files and environment describe the current tool and surroundings; the session refuses to continue if they differ
-        from those of the plan. If no file describes them, the record of the run is used. `say` receives a sentence
-        about the source.
+        Configuration files and environment describe the present tool and surroundings; the session refuses to continue
+        if they differ from those of the plan. If they describe none, those in run.json are used. `say` receives a
+        sentence about which of these is used.
         """
         described = self._or_those(header.get("said", {}))
         found, before = described.settings(), recorded_cell(header["config"])
@@ -236,12 +236,12 @@ BAG_TOPICS = _combined(
 
 
 class Number(click.FloatRange):
-    """A finite number within a range; `click` alone would accept nan."""
+    """Type of an option: a finite number within a range. The type of `click` would accept nan."""
 
     name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return the number."""
+        """Return the typed number. A number that is not finite or outside the range is a usage error."""
         number: float = super().convert(value, param, ctx)
         if not isfinite(number):
             self.fail(f"'{value}' is not a number.", param, ctx)
@@ -252,7 +252,7 @@ POSITIVE = Number(0, min_open=True)
 
 
 def require_extra(extra: str, what: str, *modules: str) -> None:
-    """Raise `ConfigError` before any work if `what` needs a missing package: one of `modules`, part of an extra."""
+    """Raise `ConfigError` if a package that `what` needs, one of `modules`, is missing; the message names the extra."""
     from ftdrivers.installation import missing_extra
 
     if missing := [name for name in modules if importlib.util.find_spec(name) is None]:
@@ -268,11 +268,11 @@ class ViewOptions:
 
     @property
     def wanted(self) -> bool:
-        """Whether there is a page; an address implies it."""
+        """Whether the command shows a page; an address implies it."""
         return self.view or self.address is not None
 
     def require(self, *, once: bool = False, allow_control: bool = False) -> None:
-        """Raise `ConfigError` for options that would have no effect, or if a package for the page is missing."""
+        """Raise `ConfigError` if `once` or `allow_control` contradict these options, or if the page lacks a package."""
         if once and self.wanted:
             raise ConfigError("--view cannot be combined with --once: leave one of the two out")
         if allow_control and not self.wanted:
@@ -282,7 +282,7 @@ class ViewOptions:
 
     @contextmanager
     def page(self, title: str) -> Iterator["Page | None"]:
-        """Serve a page while the block runs, and print its address; yield None without --view."""
+        """Serve a browser page while the block runs, and print its address; without --view, yield None."""
         from ftdrive.servers.http_gate import host_and_port
 
         address = None
@@ -316,13 +316,13 @@ def view_options(command: F) -> F:
 
 
 class NewFile(click.Path):
-    """A new file. It is rejected before any work if it already exists or its folder does not."""
+    """Type of an option: a new file. A file that exists, or whose folder does not, is rejected before any work."""
 
     def __init__(self) -> None:
         super().__init__(dir_okay=False, path_type=Path)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path; raises `ConfigError`."""
+        """Return the path. Raises `ConfigError` if the file exists or its folder does not."""
         path = Path(fsdecode(super().convert(value, param, ctx)))
         try:
             require_new(path)
@@ -344,7 +344,7 @@ PLAN_FILES = _combined(
 
 
 def simulate(words: str = "Use an emulated cell; --sensor emulated://NAME selects its sensor.") -> Callable[[F], F]:
-    """Return the option --simulate, which every command accepts."""
+    """Return the option --simulate with the help text `words`."""
     return click.option("--simulate", is_flag=True, help=words)
 
 
@@ -352,9 +352,9 @@ EMULATED_SENSOR = click.option("--sensor", metavar="emulated://NAME", help="With
 
 
 def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated: Mapping[str, object] = {}) -> None:
-    """Raise `ConfigError` for an option that --simulate excludes, or that needs --simulate.
+    """Raise `ConfigError` for an option in `real` together with --simulate, or one in `emulated` without it.
 
-    `real` and `emulated` map options to values; None, False or an empty value means that the option is not given.
+    Both map options to their values; None, False or an empty value means that the option is not given.
     """
     if given := [option for option, value in (real if simulate else emulated).items() if value]:
         fix = "leave one of the two out" if simulate else "add --simulate, or leave it out"
@@ -362,7 +362,7 @@ def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated:
 
 
 class SourceOptions(NamedTuple):
-    """Cell and calibration for a compensated stream, from the options of `SOURCE`."""
+    """Options, added by `SOURCE`, that choose cell and calibration for a compensated stream."""
 
     path: Path | None
     tool: str | None
@@ -371,7 +371,7 @@ class SourceOptions(NamedTuple):
     simulate: bool
 
     def calibration(self) -> "CalibrationResult | None":
-        """Return the calibration, read from a file or made in the emulated cell; None for a tool or without options."""
+        """Read the calibration file, or with --simulate make a calibration in an emulated cell; else return None."""
         from ftdrive.runs.calibration import read_calibration
         from ftdrive.session.rehearsal import short_calibration
         from ftdrive.terminal.screen import open_operator
@@ -383,14 +383,14 @@ class SourceOptions(NamedTuple):
     def stream(
         self, cell: CellConfig | None, calibration: "CalibrationResult | None", tool: str | None, **options: Any
     ) -> "Stream":
-        """Return the stream of a cell or of an emulated one, not opened yet; a tool replaces the calibration.
+        """Return the stream of `cell`, or without one of an emulated cell, still closed; `tool` replaces a calibration.
 
         Raises `ConfigError` if there is neither a calibration nor a tool. `options` are passed to `open_stream`.
         """
         from ftdrive.library import open_stream
         from ftdrive.session.rehearsal import station_of
 
-        # an emulated cell ends with its stream, so each stream gets a new one
+        # a new emulated cell for each stream, because it ends with its stream
         emulated = station_of(calibration, self.described.sensor) if cell is None and calibration is not None else None
         if (place := cell or emulated) is None or not (tool or calibration):
             raise ConfigError(
@@ -404,7 +404,7 @@ class SourceOptions(NamedTuple):
     def open(
         self, stack: ExitStack, frame: "WrenchFrame", track: "Tracking" = "off", stages: Mapping[str, Any] = {}
     ) -> "Stream":
-        """Open the stream with these stages until `stack` closes it; print its state and warnings."""
+        """Open the chosen stream with these stages until `stack` closes; print the calibration's state, warnings."""
         from ftdrive.terminal.console import messages
 
         calibration = self.calibration()
@@ -419,7 +419,7 @@ class SourceOptions(NamedTuple):
         return stream
 
     def require_alone(self, others: Mapping[str, object]) -> None:
-        """Raise `ConfigError` if options are given that need an arm or a calibration, including `others`."""
+        """Raise `ConfigError` if an option excluded by --raw, for a sensor alone, is given: its own or in `others`."""
         own = {"--calibration": self.path, "--tool": self.tool, "--robot": self.described.robot}
         if given := [option for option, value in {**own, **others}.items() if value]:
             raise ConfigError(
@@ -429,7 +429,7 @@ class SourceOptions(NamedTuple):
     def open_log(
         self, stream: "Stream", stack: ExitStack, say: Callable[[str], object]
     ) -> Callable[[Mapping[str, files.JSON]], None]:
-        """Return a function that logs weighings until `stack` ends, unless the calibration is temporary.
+        """Return a function that logs weighings until `stack` closes; for a temporary calibration it does nothing.
 
         `say` receives sentences for the operator, from any thread.
         """
@@ -485,7 +485,7 @@ TRACK = click.option(
 
 
 def frame_options(axes: "Axes", about: str) -> Callable[[F], F]:
-    """Return the options --axes and --about with these defaults, passed as one `frame` of type `WrenchFrame`."""
+    """Return the options --axes and --about, passed as one argument `frame`, a `WrenchFrame`, with these defaults."""
     point = "Reference point of the torque: sensor, flange, tcp, or x,y,z in m from the flange in its axes."
     choice = click.Choice(["sensor", "flange", "base", "tcp"])
 
@@ -522,7 +522,7 @@ def _checked_stages(_context: click.Context, _parameter: click.Parameter, text: 
             raise ConfigError(f"--stages has no setting '{name}': give NAME=VALUE with one of {', '.join(STAGE_TEXTS)}")
         try:
             found[name] = checked_value(name, parsed_json(value))
-        except ValueError:  # the value is a text
+        except ValueError:  # no JSON, so a text
             found[name] = checked_value(name, value)
     return found
 
@@ -539,7 +539,7 @@ STORE = click.option("--store", "url", metavar="URL", help="Database to use, ins
 
 @contextmanager
 def declined_aborts() -> Iterator[None]:
-    """Print why the operator ended a session, and abort the command."""
+    """If the operator declines in the block, print the reason and abort the command."""
     from ftdrive.terminal.console import messages
 
     try:
@@ -613,11 +613,11 @@ def TABLE(command: Callable[..., None]) -> Callable[..., None]:
 
 
 REPORTED = ("method", "orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up", *TABLE_NAMES)
-"""Names of the options of `solve` that `report` also has."""
+"""Names of those options of `ftdrive solve` that `ftdrive report` has too."""
 
 
 def typed_options(context: click.Context, names: Sequence[str] | None = None) -> tuple[str, ...]:
-    """Return the options that were given, as words for a shell; only those in `names` if it is not None."""
+    """Return the options given on the command line, quoted for a shell; with `names`, only those."""
     words = list[str]()
     for one in context.command.params:
         is_given = one.name is not None and context.get_parameter_source(one.name) is not ParameterSource.DEFAULT

@@ -18,12 +18,12 @@ from ftdrive.terminal.console import message_console, messages, working
 
 
 class Duration(click.ParamType):  # type: ignore[type-arg]  # a generic type in newer versions of click only
-    """A duration such as 90, 60s, 10min or 1h; the value is in s."""
+    """Type of an option: a duration such as 90, 60s, 10min or 1h, converted to s."""
 
     name = "duration"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return the duration in s."""
+        """Return a typed duration in s."""
         if isinstance(value, float):
             return value
         found = re.fullmatch(r"(\d+\.?\d*)(s|min|h)?", value)
@@ -90,7 +90,7 @@ def record(
 
 
 def _report_recording(recorder: Recorder, frame: WrenchFrame, name: str, *, as_json: bool) -> None:
-    # the rate over all samples, because that of the first half second may differ a lot
+    # the rate over all samples, because the rate over the first half second may differ a lot
     rate = f"{recorder.rate_Hz:.0f} Hz"
     for path in recorder.saved:
         samples = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, {rate}, gaps: {recorder.gaps}"

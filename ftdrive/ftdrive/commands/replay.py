@@ -20,7 +20,7 @@ from ftdrive.terminal.console import answer, indented, messages, working
 from ftdrive.terminal.report import print_result
 from ftdrive.terminal.screen import open_operator
 
-# Tolerance for linear algebra, which rounds differently on different processors.
+# Results may differ by this many sigmas, because linear algebra rounds differently on different processors.
 _ROUNDING_SIGMA = 1e-6
 
 

@@ -102,14 +102,14 @@ def report(
     orientation, drift, *known, up = (shared[name] for name in REPORTED[1:7])
     given = SolveOptions(method, orientation, drift, known_values(*known), up_direction(up), table=table)
     options = replace(given, words=typed_options(click.get_current_context(), REPORTED))
-    gc.freeze()  # otherwise, garbage collection would scan the imports again and again, as in `fleet status`
+    gc.freeze()  # exempts imported modules from garbage collection, which would scan them again and again
     with unpack(source) if source is not None else _report_folder(sensor) as found:
         with working("Solving"):
             subject = read_subject(found, options, parent)
         trusted = trust_facts(subject.result, found, store_url, datetime.now(UTC))
         if trusted["store_error"]:
             messages.print(indented(" ! ", MAY_BE_MISSING.format(trusted["store_error"])))
-        if source is not None and found != source:  # a bundle was unpacked
+        if source is not None and found != source:  # `source` is a bundle, unpacked to `found`
             command = subject.reproduce.replace(str(found), shlex.quote(str(source)))
             subject = replace(subject, source=source, reproduce=command)
         with working("Comparing methods and drawing"):
@@ -137,7 +137,7 @@ def _save_report(text: str, folder: Path) -> Path:
 
 
 def _report_folder(sensor: str | None) -> AbstractContextManager[Path]:
-    from ftdrive.session.rehearsal import rehearsed_run  # this imports the drivers and the screen
+    from ftdrive.session.rehearsal import rehearsed_run  # slow: imports the drivers and the screen
     from ftdrive.terminal.screen import open_operator
 
     return rehearsed_run(open_operator(), sensor)

@@ -14,7 +14,7 @@ _ROS_ARGS = "--ros-args"
 
 
 class _RosCommand(click.Command):
-    """A command that passes `--ros-args` and all arguments after it to ROS instead of click."""
+    """A command that leaves `--ros-args` and all arguments after it to ROS; click does not parse them."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         start = args.index(_ROS_ARGS) if _ROS_ARGS in args else len(args)
@@ -39,8 +39,8 @@ def ros2(source: SourceOptions, frame: WrenchFrame, ros_args: Sequence[str]) -> 
     `ros2 param describe` explains each parameter. While a device sends no samples or the calibration does not fit, no
     wrench is published and /diagnostics gives the reason. The arm is only read, never moved. Press Ctrl-C to stop.
     """
-    ros2_module("rclpy")  # a missing package raises here, before any work
-    from ftdrive.servers.ros2 import Ros2Node  # this imports rclpy
+    ros2_module("rclpy")  # raise before any work if ROS is missing
+    from ftdrive.servers.ros2 import Ros2Node  # needs rclpy
 
     given = source.path is not None
     calibration = source.calibration() if given else None

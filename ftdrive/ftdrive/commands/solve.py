@@ -54,7 +54,7 @@ _EPILOG = "\b\nMETHOD is one of\n" + fill(
     ", ".join(_METHODS), 76, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
 )
 
-# Options that control only what happens to a result.
+# Options that do not affect a result, only how it is saved and printed.
 _SAVING = ("output", "force", "every", "as_json")
 HEADINGS = {
     "How to solve": "--method --as-published --drift --from --together --point-mass",
@@ -146,7 +146,7 @@ def solve_command(
     with _rehearsed_folder(sensor, options.method, cases=cases) if simulate else nullcontext() as run:
         _solve_each(sources if run is None else [run], options, show, as_json)
     if output is not None and sources and sources[0].is_dir():
-        index_run(sources[0], messages.print)  # the result, if it was saved in the run
+        index_run(sources[0], messages.print)  # adds the result if it was saved in the run
 
 
 def _poses_of(test: Path, options: SolveOptions) -> CalibrationDataset:
@@ -155,7 +155,7 @@ def _poses_of(test: Path, options: SolveOptions) -> CalibrationDataset:
 
 
 def _rehearsed_folder(sensor: str | None, method: str, *, cases: bool) -> AbstractContextManager[Path]:
-    from ftdrive.session.rehearsal import rehearsed_run  # this imports the drivers and the screen
+    from ftdrive.session.rehearsal import rehearsed_run  # slow: imports the drivers and the screen
     from ftdrive.terminal.screen import open_operator
 
     poses = {"poses": 24 if method in (*SPECIAL, "all") else 6, "method": "ml" if method == "all" else method}
@@ -170,7 +170,7 @@ def _solve_each(
 ) -> None:
     first_failure: AcceptanceError | DataError | None = None
     for source in sources:
-        # If a source fails, the others are still solved.
+        # catch the error, so that the other sources are still solved
         try:
             with unpack(source) as place:
                 show(options, as_json, source, place)
@@ -180,7 +180,7 @@ def _solve_each(
             first_failure = first_failure or error
             if as_json and not isinstance(error, NotAccepted):
                 write_json({"schema_version": 1, "source": str(source), "error": str(error)})
-            # An error about a file contains its name, but not its folder; an error about a solution contains neither.
+            # Add the source unless the error names it: an error about a file has its name, one about a solution none.
             is_named = isinstance(error, DataError) and [one.name for one in sources].count(source.name) == 1
             echo(in_one_line(f"error: {error}" if is_named else f"error: {source}: {error}"), err=True)
     if first_failure is not None:
@@ -201,7 +201,7 @@ def _show_result(
         write_json({"source": str(source), "hints": found, **result.to_dict()})
     else:
         print_result(result, drift=drift_check(records) if records else None, records=records, every=every)
-        if not click.get_current_context().params["simulate"]:  # a simulated run is temporary
+        if not click.get_current_context().params["simulate"]:  # its run is temporary
             messages.print_next(*_next_commands(result, source, output))
     _save(result, output, force, as_json)
 
@@ -241,7 +241,7 @@ def _solve_together(
             data = read_place(place, options)
             if not isinstance(data, RecordedData):
                 raise ConfigError(f"--together needs poses at rest, and {source} is in motion: leave it out")
-            # Leave out the earlier result of a new tool, which would otherwise be counted once per run.
+            # without the earlier result of a run with a new tool, which would otherwise be counted once per run
             results.append(_solve_shown(replace(data, earlier=None), options))
     result = together(results)
     if as_json:

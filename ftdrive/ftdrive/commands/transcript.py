@@ -63,8 +63,8 @@ def _emulated_address(sensor: str | None) -> str:
 
 
 def _record_bytes(sensor: str, path: Path, duration_s: float, *, kept: bool = True) -> tuple[str, dict[str, Any]]:
-    """Record; return the driver's address, and what the driver received. Print the name of the file if it is `kept`."""
-    # Check before an emulated sensor starts.
+    """Record a sensor's bytes; return its address for the driver, and what this received. If `kept`, print the path."""
+    # before an emulated sensor starts
     if sensor.startswith("ur-ft:") or sensor == f"{EMULATED}ur-ft":
         raise ConfigError(
             f"{sensor} is read over RTDE, which is not recorded: capture TCP port 30004 of the arm with Wireshark"
@@ -81,7 +81,7 @@ def _record_bytes(sensor: str, path: Path, duration_s: float, *, kept: bool = Tr
         "url": url,
         "duration_s": duration_s,
         "utc": datetime.now(UTC).isoformat(),
-        "t_ns": clock.now_ns(),  # the same time as `utc`, to which the times of all lines are related
+        "t_ns": clock.now_ns(),  # the time of `utc` on the clock of the lines
         "versions": versions(),
     }
     writer = Writer(path, header, clock)
@@ -113,11 +113,11 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
             _record_bytes(_emulated_address(sensor), path, 1.0, kept=False)
             loaded = Transcript.load(path)
     elif file is not None:
-        open_file(file).close()  # a pipe or a device file raises an error here
+        open_file(file).close()  # raises for a pipe or a device file
         loaded = Transcript.load(file)
     else:
         raise ConfigError("no transcript is given: add its FILE, or --simulate")
-    # With this clock, a busy computer plays more slowly, but never late.
+    # on a clock of its own, so that on a busy computer the playback slows down instead of missing its times
     played = loaded.play(LocalClock())
     recorded = {key: value for key, value in loaded.end.items() if key not in {"event", "t_ns"}}
     if as_json:

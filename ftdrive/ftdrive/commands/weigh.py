@@ -82,7 +82,7 @@ def weigh_command(
         on_screen = not (once or as_json) and has_screen()
         if (page := stack.enter_context(view.page("ftdrive weigh"))) is not None:
             shown = WeighPage(page, weighing, controls=allow_control)
-            # the full screen would hide printed messages, but has a line for notes
+            # on the full screen, errors of the page go to its line for notes, because it would hide printed messages
             say = partial(setattr, weighing, "note") if on_screen else messages.print
             stack.enter_context(drawing(page, shown.draw, say))
         if on_screen:
@@ -96,7 +96,7 @@ def weigh_command(
 def _print_weights(
     weighing: Weighing, turns: Iterable[object], *, once: bool, waits: bool, poses: int, as_json: bool
 ) -> None:
-    """Print each new weight or fault as a line; with `once`, return after the first weight."""
+    """Print each new weight, or reason for none, as a line; with `once`, return after the first weight."""
     clock, info = weighing.stream.clock, weighing.stream.info
     head = {"schema_version": 1, "calibration_id": info.calibration.id, "marks": list(info.marks)}
     begin_s = clock.now_s()

@@ -48,7 +48,7 @@ _R_FLANGE_TOOL0 = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Names, and measured values or None. Raises `ConfigError` for a name that is invalid in files."""
+    """Names of frames, and values that a calibration lacks. Raises `ConfigError` for invalid or equal names."""
 
     base_frame: str = "base"
     """Name of the base frame, with any prefix: `base` is that of the controller, `base_link` that of a UR in ROS."""
@@ -173,7 +173,7 @@ class _Values:
 
     @property
     def inertia_kg_m2(self) -> Array | None:
-        """Inertia (3, 3) of the tool about its centre of mass, sensor axes; None if not identified or not physical."""
+        """Inertia (3, 3) of the tool about its centre of mass, sensor axes; None if unknown or of no possible body."""
         if self.calibration.motion is None:
             return None
         J = self.calibration.motion.inertia_kg_m2
@@ -196,7 +196,7 @@ def _quaternion(v: _Values) -> Array:
 
 
 def _payload_inertia(v: _Values) -> str:
-    """Return the inertia of everything on the flange about its centre of mass, flange axes; the sensor is a point."""
+    """Return the inertia of the whole payload about its centre of mass, flange axes; the sensor counts as a point."""
     if (J := v.inertia_kg_m2) is None:
         return "0, 0, 0, 0, 0, 0"
     payload, Q, (tool_kg, p_sensor_com_m) = v.payload, v.calibration.R_flange_sensor, true_tool(v.calibration)
@@ -438,7 +438,7 @@ def _undecoded(name: str, calibration: CalibrationResult) -> Iterator[str]:
 
 
 def _lossless_formats(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]:
-    """Yield lossless formats that subtract at least as much as the target, and read this sensor if the target does."""
+    """Yield formats that express the whole calibration, subtract as much, and read the sensor if the target does."""
     for name, other in FORMATS.items():
         as_much = set(other.subtracts) >= set(target.subtracts) and other.has_own_reading <= target.has_own_reading
         if as_much and not list(_lost(calibration, other)):

@@ -46,7 +46,7 @@ class CommandConsole(Console):
             self.print(self._next(command), soft_wrap=True)
 
     def _next(self, text: str) -> str:
-        r"""Return a command and the text after it; a long command is folded with \ before its last option."""
+        r"""Lay out a command and the text after it; a command that is too long is broken with \ at its last option."""
         command, _, why = as_typed(text).partition("   ")
         shown = f"   {command}"
         if not self.soft_wrap and len(shown) > self.width:

@@ -224,7 +224,7 @@ def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
     force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
     apart_s = abs(drift.elapsed_s)
     again = f"first pose again after {apart_s:.0f} s"
-    if drift.elapsed_s < 0:  # with --redo 1
+    if drift.elapsed_s < 0:  # `--redo 1` takes the first pose last
         again = f"first pose, repeated {apart_s:.0f} s after the return to it"
     words = f"{again}, {force_N:.3f} N, {torque_Nm:.4f} N·m away: "
     if worst < 4:

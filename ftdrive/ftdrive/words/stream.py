@@ -148,7 +148,7 @@ class View:
         return float(shares[worst]), AXES[worst]
 
     def in_line(self, *, timed: bool) -> str:
-        """Return a line with the wrench (raw without a calibration) and its axes; `timed` adds time and contact."""
+        """Return a line with the wrench (as measured if not calibrated) and frame; `timed` adds time and contact."""
         reading, is_raw = self.reading, self.info.is_raw
         assert reading is not None  # noqa: S101 - there is one from the first sample on
         wrench = reading.raw_in_frame if is_raw else reading.wrench
@@ -254,7 +254,7 @@ class StreamSummary:
         )
 
     def views(self, *, raises: bool = False) -> Iterator[View]:
-        """Read; once the noise is known, yield a view per `MEAN_S`. Raise failures at once, or after a time-out."""
+        """Read; once the noise is known, yield a view per 0.1 s. A failure raises at once if `raises`, else later."""
         feed, stream = self._feed, self._feed.stream
         begin_ns: int | None = None
         is_known = False

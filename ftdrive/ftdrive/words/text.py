@@ -72,7 +72,7 @@ def visible(text: str) -> str:
 
 
 def in_one_line(text: str) -> str:
-    r"""Return text with newlines as `\n`, except before a command, so that a name cannot begin a line.
+    r"""Return text with newlines as `\n`, except before a command, so that a file's name cannot begin a line.
 
     Examples
     --------

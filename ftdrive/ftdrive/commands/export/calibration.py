@@ -15,7 +15,7 @@ from ftdrive.session.rehearsal import rehearsed_run
 from ftdrive.terminal.console import indented, messages
 from ftdrive.terminal.screen import open_operator
 
-# Text, new file, JSON entries before and after the file name, and whether to print JSON.
+# An export to print or save: text, new file or None, JSON entries before and after the file's name, whether JSON.
 Made = tuple[str, Path | None, Mapping[str, object], Mapping[str, object], bool]
 
 

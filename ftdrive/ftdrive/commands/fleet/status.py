@@ -40,12 +40,12 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     """
     if page_path is not None:
         require_extra("fleet", "--html", "jinja2")
-    gc.freeze()  # otherwise, garbage collection of the imports would take a tenth of the time
+    gc.freeze()  # exempts imported modules from garbage collection, which would take a tenth of the time
     found, now = open_store(url), datetime.now(UTC)
     observed = Observed.read(found, now)
     fleet = fleet_of(observed, found)
     if page_path is not None:
-        from ftdrive.fleet.page import fleet_page  # needs an extra
+        from ftdrive.fleet.page import fleet_page  # needs the extra `fleet`
 
         write_new(page_path, fleet_page(fleet, observed, found.name))
         message_console(as_json).print(f" Saved {page_path}")
@@ -71,7 +71,7 @@ def _status_row(one: CellState, now: datetime) -> tuple[str, ...]:
     return (one.cell, one.tool_in_words, one.verdict or "none", age, verified, drift, due, weighed)
 
 
-# All ports from 9100 to 9999 are assigned to Prometheus exporters.
+# Default port, outside 9100 to 9999, which are all assigned to other Prometheus exporters.
 PORT = 10018
 MONITORING = Path(__file__).parents[2] / "fleet" / "monitoring"
 
@@ -107,7 +107,7 @@ def fleet_serve(address: str, url: str | None) -> None:
 
 
 def _status_page(store: Store) -> str:
-    from ftdrive.fleet.page import fleet_page  # needs an extra
+    from ftdrive.fleet.page import fleet_page  # needs the extra `fleet`
 
     observed = Observed.read(store, datetime.now(UTC))
     return fleet_page(fleet_of(observed, store), observed, store.name)

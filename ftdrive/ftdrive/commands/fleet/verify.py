@@ -74,7 +74,7 @@ def fleet_verify(names: Sequence[str], due: bool, url: str | None) -> None:
     if failed:
         raise NotAccepted(f"the verification failed in {', '.join(failed)}: the lines above give the reasons")
     if errors:
-        raise click.exceptions.Exit(exit_code(errors[0]) or 1)  # the message of the error has already been printed
+        raise click.exceptions.Exit(exit_code(errors[0]) or 1)  # its message has already been printed
 
 
 def _select_cells(cells: Sequence[StoredCell], names: Sequence[str]) -> list[StoredCell]:
@@ -115,7 +115,7 @@ def _session(cell: CellConfig, path: Path, options: SessionOptions) -> Verified:
 
 
 def _read_cell(one: StoredCell) -> CellConfig:
-    """Read the configuration of a cell; raises `ConfigError` if the store has another robot for it."""
+    """Read the configuration file of a cell. Raises `ConfigError` if its robot is not the one in the store."""
     cell = CellOptions(Path(one.config)).cell()
     if one.robot_host not in {None, cell.robot.host}:
         raise ConfigError(
@@ -136,7 +136,7 @@ def _is_attended(one: StoredCell, cell: CellConfig) -> bool:
 
 
 def _fixable_message(error: Exception) -> str:
-    """Return the message of an error that a user can fix; raise any other error."""
+    """Return the message of an error that a user can fix; raise an error that is a defect of ftdrive."""
     if exit_code(error) is None:
         raise error
     return in_a_sentence(error)
