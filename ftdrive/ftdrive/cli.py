@@ -41,7 +41,7 @@ _closed_terminals: list[int] = []
 def _closed_pipe() -> Iterator[None]:
     try:
         yield
-    except BrokenPipeError as error:  # click would exit with 1 for every broken pipe or socket
+    except BrokenPipeError as error:  # for which click would always exit with code 1
         from ftdrive.terminal.supervisor import Supervisor
 
         if any(Supervisor(sys.stdin, stream, "it").absence() for stream in (sys.stdout, sys.stderr)):

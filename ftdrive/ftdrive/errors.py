@@ -34,7 +34,7 @@ class BadBundle(DataError):
 
 
 class RecordingHasGaps(DataError):
-    """Samples are missing in a recording that is otherwise complete."""
+    """A recording is complete, but samples within it are missing."""
 
 
 class NotAccepted(AcceptanceError):

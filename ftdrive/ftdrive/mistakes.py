@@ -77,7 +77,7 @@ KINDS: Final[Mapping[str, Kind]] = {
 _TEXTS, _BINARIES = {".csv", ".tsv", ".txt", ".dat", ".log"}, {".parquet", ".db3", ".bag", ".mcap"}
 _TWO_NUMBERS = re.compile(rb"\d[\s,;]+[-+.]?\d")
 _FORMAT = re.compile(rb"ftdrive\.(\w+)/\d")
-# Header of a section in a TOML file that describes a cell.
+# Matches the header of a section that a TOML file has only if it is the configuration of a cell.
 _CELL = re.compile(rb"^\[(?:robot|sensor|tool|workcell)\]", re.MULTILINE)
 _START = 4096
 _ALIKE = 0.75
@@ -164,7 +164,7 @@ def _unmatched_arguments(group: click.Group, arguments: Sequence[str]) -> Iterat
             words.append(argument)
         else:
             places = [one for one in command.params if isinstance(one, click.Argument)]
-            # the runs of `diff` may also be given by their id
+            # the arguments of `diff` are always checked, although they have no type of a path: they may be ids
             if not places or command.name == "diff" or _is_read(places[min(number_of_place, len(places) - 1)]):
                 yield number, " ".join(words), argument, command
             number_of_place += 1

@@ -139,7 +139,7 @@ class CellOptions:
         return {name: getattr(self, name) for name in kept} | {"config": self.config and str(self.config)}
 
     def _or_those(self, begun: Mapping[str, Any]) -> "CellOptions":
-        """Return these options, completed with those that a run stored by `to_dict`; a missing file is ignored."""
+        """Return these options, completed with those that a run stored; a configuration file that is gone is unused."""
         config = Path(begun["config"]) if begun.get("config") else None
         return CellOptions(
             self.config or (config if config is not None and config.is_file() else None),

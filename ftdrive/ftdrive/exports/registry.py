@@ -177,7 +177,7 @@ class _Values:
         if self.calibration.motion is None:
             return None
         J = self.calibration.motion.inertia_kg_m2
-        # The moments of a rigid body are positive, and none is larger than the sum of the others.
+        # principal moments of a rigid body are positive, and none is larger than the sum of the other two
         low, middle, high = np.linalg.eigvalsh(J)
         return J if low > 0 and high <= low + middle else None
 
@@ -343,8 +343,8 @@ def _compensations(calibration: CalibrationResult, target: ExportFormat) -> tupl
 def _largest_norm(matrix: Array, offset: Array) -> float:
     """Return the maximum of |matrix @ vec(R) + offset| over rotations R.
 
-    The square is convex in R, so the rotation that maximises its tangent never decreases it. Ascent from the 60
-    rotations of the icosahedron reaches every maximum.
+    Its square is convex in R, so a step to the rotation that maximises its linearisation never decreases it. Steps from
+    the 60 rotations of the icosahedron reach every maximum.
     """
     R = Rotation.create_group("I").as_matrix()
     norms = np.zeros(len(R))

@@ -138,7 +138,7 @@ def _scene(scene: dict[str, Any]) -> Iterator[str]:
     lean_rad = float(scene["lean_rad"])
     names = [name for name, angle in MOUNTINGS.items() if abs(lean_rad - angle) < 1e-9]
     yield f"mounted: {names[0] if names else f'base leans {degrees(lean_rad):.1f} deg towards its -x'}"
-    # The first plane is the mounting surface.
+    # the first plane of a scene is the surface on which the arm is mounted
     for plane in scene["planes"]:
         normal = ":".join(f"{value:.6g}" for value in plane["normal"])
         place_mm = 1e3 * float(plane["offset_m"])

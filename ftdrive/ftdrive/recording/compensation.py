@@ -46,7 +46,7 @@ def source_to_compensate(
     everything: bool,
     say: Callable[[str], object],
 ) -> tuple[AnyRecording, dict[str, float] | None]:
-    """Return the recording with its calibration, and for a recording from another program the delay and its sigma.
+    """Return the recording with its calibration; if another program wrote it, also the wrench's delay and sigma, s.
 
     `name` names the calibration, `delay_s` is a number, "auto" or None. With `everything`, all columns are read. `say`
     receives a description of what was recognised in the tables.
@@ -85,9 +85,9 @@ def compensate_recording(
 ) -> tuple[dict[str, Any], BaseException | None]:
     """Compensate a recording with the calibration in its header: subtract the bias and gravity.
 
-    Its beginning is read to estimate the noise, then all of it; `estimate_bias` first reads it once more. The result is
-    given in `frame`. `output` is a new recording for the result and the events that still apply. `show` receives
-    progress messages.
+    The first 30 s are read to estimate the noise, then the whole recording; with `estimate_bias`, the whole recording
+    is read once more before. The result is given in `frame`. `output` is a new recording for the result and the events
+    that still apply. `show` receives progress messages.
 
     Returns samples, duration_s, gaps; `raw` and `compensated`, each with the root mean square and the maximum of the
     force in N and the torque in N·m; `contacts` with time since the first sample in s, duration in s, peak in N and

@@ -109,7 +109,7 @@ def tables_of(
 def moving_source(source: Any, options: SolveOptions) -> Path | tuple[Table, Table] | None:
     """Return a recording in motion for `solve_recording`; None for poses at rest. Raises the errors of `tables_of`."""
     if options.pair is None and isinstance(source, Path):
-        # A run folder or a dataset has poses at rest.
+        # A run folder or a dataset has only poses at rest.
         has_poses = source.is_dir() or source.suffix == ".json"
         if has_poses and not is_bag(source):
             return None
@@ -152,7 +152,7 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
         raise
     except ProtocolError as error:
         raise BadDataset(f"{path.name}: {error}") from error
-    except Exception as error:  # raised by rosbags, SQLite, zstd or YAML
+    except Exception as error:  # any error of rosbags, SQLite, zstd or YAML
         raise BadDataset(f"{path.name} cannot be read ({error}): it is damaged or has another version") from error
     origin_ns = min(int(wrench[0].min()), int(poses[0].min()))
     return (

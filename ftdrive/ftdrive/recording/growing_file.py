@@ -1,4 +1,4 @@
-"""A file that grows as NAME.partial, and is renamed when it is complete."""
+"""A file that is written as NAME.partial, and renamed to NAME when it is complete."""
 
 import os
 from contextlib import suppress
@@ -22,7 +22,7 @@ class GrowingFile:
 
     @property
     def size(self) -> int:
-        """Size so far, bytes."""
+        """Size of the file so far, bytes."""
         return self._file.tell()
 
     def add(self, content: bytes) -> int:
@@ -42,7 +42,7 @@ class GrowingFile:
         """Write the end, sync the file to disk and rename it. Raises `OSError` if that fails or the new name exists."""
         try:
             self._write_end()
-            # Sync before closing releases the lock, because a sync may take seconds.
+            # Sync first, because it may take seconds, and closing releases the lock on the file.
             os.fsync(self._file.fileno())
         finally:
             self._file.close()
@@ -66,7 +66,7 @@ def _lock(file: IO[bytes]) -> bool:
     """Lock a file until it is closed; return False if another process has locked it."""
     try:
         import fcntl
-    except ImportError:  # Windows, where no stream is recorded
+    except ImportError:  # on Windows, where no stream is recorded
         return True
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

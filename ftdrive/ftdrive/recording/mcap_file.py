@@ -295,7 +295,7 @@ def read_mcap(path: Path, columns: Collection[str]) -> Generator[Piece, None, st
                 if opcode == _INDEX:
                     content.indexes.append(data)
                 elif opcode == _CUT:
-                    # The last chunk of an interrupted file may lack some indexes.
+                    # ignore errors, because the last chunk of an interrupted file may lack some indexes
                     with suppress(ValueError):
                         content.close_chunk()
                     yield content.piece(1.0)

@@ -312,7 +312,7 @@ def convert_recording(
 
 @contextmanager
 def _delay_signals() -> Iterator[None]:
-    """Delay Ctrl-C, `kill` and the closing of the terminal, so that each file gets the whole piece."""
+    """Delay the effect of Ctrl-C, `kill` and a closed terminal to the end of the block, so that no write is cut."""
     waiting: list[tuple[Any, Any, Any]] = []
     handlers = {}
     if threading.current_thread() is threading.main_thread():

@@ -276,7 +276,7 @@ class Recording(Displayed):
 
     @property
     def table(self) -> NDArray[np.void]:
-        """(n,) samples with one named field per number, for `pandas.DataFrame`; names as in the CSV format."""
+        """(n,) samples as records with one field per number, named as in the CSV format, for `pandas.DataFrame`."""
         return self.rows.view(flat_layout(self.rows.dtype))
 
     def to_frame(self) -> Any:

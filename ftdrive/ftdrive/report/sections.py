@@ -370,7 +370,7 @@ _PREDICTED = (
 _AS_PREDICTED = 1.2
 _AS_GOOD = "No sigma is more than 20 % larger than predicted."
 _WHY_LARGER = "Noise or errors of this sensor are larger than the plan assumed."
-# Significance level for a difference between two results of one tool.
+# Two results of one tool are reported as different if the p-value of the joint test is below this.
 CHANGED_P = 1e-3
 
 

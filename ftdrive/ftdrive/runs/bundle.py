@@ -60,7 +60,7 @@ _NOT_PERSONAL = {"root", "user", "robot", "ur", "admin", "ubuntu", "operator", "
 _VERSIONS = ("versions", "packages", "firmware")
 # Bytes of a transcript are text if at least this share is printable. Others are measurements, which stay unchanged.
 _TEXT_SHARE = 0.9
-# Fields of a transcript that contain bytes in hexadecimal form.
+# Fields of a transcript that contain bytes to or from a sensor, in hexadecimal form.
 _ON_THE_WIRE = ("hex", "request", "reply")
 
 

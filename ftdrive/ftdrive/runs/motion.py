@@ -30,7 +30,7 @@ _POSES: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionRecording:
-    """Samples from the sensor and the arm, taken while the tool moved."""
+    """All samples of sensor and arm that were recorded while a free tool moved."""
 
     samples: FtSamples
     states: ArmStates

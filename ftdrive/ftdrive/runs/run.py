@@ -214,7 +214,7 @@ class Run(Displayed):
 
     @property
     def solve_command(self) -> str:
-        """Command that solves the poses of the run."""
+        """Command that solves the data of the run again."""
         with_it = "" if self.method == "ml" else f" --method {self.method}"
         return f"ftdrive solve {shlex.quote(str(self.folder))}{with_it}"
 

@@ -45,7 +45,7 @@ class RecordedRun:
         self._collected = False
 
     def go_on_to(self, q_rad: Array) -> None:
-        """Advance to the next recorded stop, which must have these joint angles (6,)."""
+        """Go to the next recorded stop. Raises `ValueError` unless it has these joint angles (6,)."""
         self._stop += 1
         if not np.array_equal(q_rad, self._records[self._stop].pose.q_rad):
             raise ValueError(f"stop {self._stop + 1} of the recording does not have the joint angles of the routine")
@@ -76,7 +76,7 @@ class SolveOptions:
     """Options of `ftdrive solve` and `ftdrive report`: facts about the data, and the solution method."""
 
     method: str = "ml"
-    """A `ftcalib.result.Method`, or "all" to compare the methods."""
+    """Solution method, a `ftcalib.result.Method`, or "all" to compare the methods."""
     orientation: Orientation = "R_base_flange"
     """Direction of the rotations in a table: flange to base coordinates, or the inverse."""
     drift: Drift = "auto"

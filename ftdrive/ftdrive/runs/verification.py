@@ -60,10 +60,10 @@ class VerificationRecord(NamedTuple):
     torque_max_Nm: float | None = None
     """Largest differences between measured and predicted force and torque; the store does not have them."""
     id: str = ""
-    """First 12 hex digits of the SHA-256 of the file; this and the following fields are unset in a recording."""
+    """First 12 hex digits of the SHA-256 of verification.json; a recording stores neither this nor later fields."""
     temperature_C: float | None = None
     bias_change: Sequence[float] | None = None
-    """(6,) change of the bias since the calibration, N and N·m, sensor axes."""
+    """(6,) estimated change of the bias since the calibration, N and N·m, sensor axes; None if not estimated."""
     bias_change_sigma: Sequence[float] | None = None
     """(6,) standard deviation of `bias_change` due to the noise of this verification's readings."""
     calibration_sigma: Sequence[float] | None = None

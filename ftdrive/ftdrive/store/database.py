@@ -174,7 +174,7 @@ class Database:
 
         With `first_by`, a row is replaced only if the new string in this column does not sort after the stored one.
         """
-        insert = import_module(f"sqlalchemy.dialects.{self._dialect}").insert(table)  # importing both is slow
+        insert = import_module(f"sqlalchemy.dialects.{self._dialect}").insert(table)  # import only one of two dialects
         new = {column.name: insert.excluded[column.name] for column in table.columns}
         key = [column.name for column in table.primary_key]
         where = None

@@ -51,7 +51,7 @@ class StoredResult:
     temperature_C: float | None
     """Temperature of the sensor, °C; None if the sensor reports none."""
     payload_kg: float | None
-    """Payload that the controller reported during the calibration, kg."""
+    """Payload set in the robot controller during the calibration, kg, as the controller reported it."""
     payload_com_m: list[float] | None
     """(3,) centre of mass, m, of the payload that the controller reported, flange axes."""
     emulated: bool = False

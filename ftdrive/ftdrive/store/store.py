@@ -31,7 +31,7 @@ class Indexed:
     results: int
     verifications: int
     weighings: int
-    """Number of weighing files, one per day."""
+    """Number of files with weighings, each of one day."""
     unreadable: tuple[str, ...]
     """Texts with path and error of the files that could not be read."""
 

@@ -14,7 +14,7 @@ from ftdrive.cell.config import user_folder
 from ftdrive.errors import ConfigError
 from ftdrive.runs.weighings import FOLDER, WeighingDay, append_weighings
 
-# Time between two writes to the store, s.
+# Default time between two writes of the log to the store, s.
 EVERY_S: Final = 30.0
 # Time-out, s, of the last write at the end of a program, slightly longer than the store's time-out of 5 s.
 _GOODBYE_S: Final = 6.0

@@ -140,7 +140,7 @@ class _FrameSource:
         self.units: Sequence[str] = [""] * len(self.names)
 
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
-        """Yield all rows at once. Raises `BadDataset`."""
+        """Yield all rows at once. Raises `BadDataset` if a cell is not a number."""
         try:
             columns = [np.asarray(self._frame[self.names[i]]) for i in use] or [np.empty((0, 0))]
             numbers = [

@@ -26,7 +26,7 @@ _NUMBER: Final = {
     ".": re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE),
     ",": re.compile(r"[+-]?(\d+(,\d*)?|,\d+)(e[+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE),
 }
-# Number of rows from which the separator and the decimal mark are recognised.
+# Separator and decimal mark are recognised from this number of rows.
 _DECIDE = 30
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?\s*(Z|[+-]\d\d:?\d\d)?")
 _UNIT = re.compile(r"[\[(]?\s*[-%°a-zA-Zµμ·*./^²0-9 ]{0,8}\s*[\])]?")

@@ -167,7 +167,7 @@ class Canvas(ABC):
     def _changes(self, console: CommandConsole, fd: int) -> bytes:
         """Return the bytes that redraw the changed lines, or all lines if the terminal's size has changed."""
         size = os.get_terminal_size(fd)
-        # some terminals report the size 0
+        # use a default size, because some terminals report the size 0
         width, height = size.columns or 80, size.lines or 24
         lines = self.lines(width, height)
         with console.capture() as captured:

@@ -53,7 +53,7 @@ class Interview:
             say(f"The answers of {when} are filled in from {self._draft}. Delete the file to start without them.")
 
     def take_options(self, given: dict[str, Any]) -> None:
-        """Use the answers given as options. Raises `ConfigError` for invalid ones."""
+        """Use the answers given as options of the command. An invalid answer raises `ConfigError`."""
         for question in QUESTIONS:
             if not (option := given.get(question.name)):
                 continue

@@ -107,7 +107,7 @@ class Keyboard:
     def _stop(self) -> None:
         thread, self._thread = self._thread, None
         if thread is not None:
-            # end the thread before the terminal discards typed input: reading a discarded key would never return
+            # end the thread before typed input is discarded, because its read of a discarded key would never return
             os.close(self._wake)
             thread.join()
         self._restore()
@@ -152,7 +152,7 @@ class Keyboard:
                 self._keys += found or ([] if held_down else [Key.OTHER])
                 word += letters or "\x1b"
         except OSError:
-            # the terminal is closed: the supervisor reports it
+            # no message, because the supervisor reports a closed terminal
             return
         finally:
             os.close(wake)

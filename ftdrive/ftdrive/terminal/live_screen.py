@@ -131,7 +131,7 @@ def _actions(feed: Feed) -> dict[str, Callable[[], object]]:
     return found
 
 
-# At this width or more, the plots are drawn to the right of the table.
+# On a terminal with at least this number of columns, the plots are drawn to the right of the table.
 _WIDE = 120
 _LEFT = 78
 # Width of the labels at the left of a plot, in cells.

@@ -133,7 +133,7 @@ class PlainOperator(_Keyless):
     def show(self, event: Event) -> None:
         """Write the lines of text about an event."""
         if isinstance(event, Asked) and event.question == self._asked:
-            # the question and the answer are already printed
+            # nothing to write, because `ask` has already printed question and answer
             return
         self._write_lines(self._text.lines(event))
 

@@ -25,7 +25,7 @@ class Supervisor:
     def __init__(self, stdin: TextIO, output: IO[str], name: str) -> None:
         self._stdin, self._input, self._output, self._name = stdin, _descriptor(stdin), _descriptor(output), name
         self._terminals = [fd for fd in (self._input, self._output) if fd is not None and os.isatty(fd)]
-        # whether a writer was connected when a question was asked
+        # whether a writer of answers was connected to the input when a question was asked
         self._answers = False
         self._hung_up = False
         self._handler_before: Any = None

@@ -86,7 +86,7 @@ def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
         width = os.get_terminal_size(file.fileno()).columns
     except (OSError, ValueError):  # not a terminal
         return text
-    # some terminals report the size 0
+    # do not fold if the terminal reports the size 0, as some do
     if width == 0:
         return text
     fold = textwrap.TextWrapper(
@@ -98,7 +98,7 @@ def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
     )
     return "\n".join(
         line if is_command(line.strip()) else unglue(fold.fill(glue(line))) + line[len(line.rstrip()) :]
-        # keep the trailing space of a prompt
+        # the white space at the end of a line, as of a prompt, is kept
         for line in text.split("\n")
     )
 

@@ -54,7 +54,7 @@ class _Field:
 
     @property
     def text(self) -> str:
-        """The answer as it would be typed in the terminal."""
+        """The answer in the field's controls, as it would be typed in the terminal."""
         typed = self.typed.strip()
         chosen = typed and f"{self.choice} {typed}" if self.key == WALLS else self.choice
         return typed if self.choice in ("", _TYPED.get(self.key)) else chosen

@@ -61,7 +61,7 @@ def label(text: str, at: ArrayLike) -> Part:
 
 
 def camera(at_m: ArrayLike, from_m: ArrayLike) -> Part:
-    """Return the initial point of view: the point (3,) looked at, and the position (3,) of the camera."""
+    """Return the camera with which a viewer starts: the point (3,) that it looks at, and its position (3,)."""
     return {"kind": "camera", "at": rounded_list(at_m), "from": rounded_list(from_m)}
 
 

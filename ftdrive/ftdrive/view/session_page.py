@@ -40,7 +40,7 @@ Parts = dict[str, Part | None]
 _FRAME_S: Final = 0.05
 # Guards that have not checked an observation for this time, s, are shown as inactive.
 _REST_S: Final = 0.5
-# A bar above this share of its limit has the colour of a warning.
+# A bar whose value is above this fraction of its limit has the colour of a warning.
 _NEAR: Final = 0.8
 # Colours of poses by their residual: for each colour, the largest residual in sigmas, and its text in the legend.
 _COLOURS: Final = ((3.0, GOOD, "residual ≤ 3 sigma"), (5.0, WARN, "≤ 5 sigma"), (np.inf, BAD, "> 5 sigma"))
@@ -152,7 +152,7 @@ class SessionPage:
         return answer
 
     def absence(self) -> str | None:
-        """Return why no operator follows the session, or None. Viewers of the page do not count as operators."""
+        """Return why no operator follows the session; None if one does. Viewers of the page are no operators."""
         return self._operator.absence()
 
     @property

@@ -60,7 +60,7 @@ class Site(Gate):
     """
 
     def __init__(self, page: Page, bound: Address) -> None:
-        _files()  # raise for a missing file before the port is opened
+        _files()  # raise for a missing package before the port is opened
         self.token = secrets.token_urlsafe(18)
         self._page = page
         # for each viewer's connection, the page version that was sent, and when its send buffer was last empty

@@ -41,7 +41,7 @@ _LEAST_FULL_SIGMA = 10.0
 # Contact-test values above this are not shown; a limit above this means that the noise is not known yet.
 _MOST_CHI2 = 1e5
 _FRAMES = (WrenchFrame(), WrenchFrame("flange", "flange"), WrenchFrame("base", "tcp"), WrenchFrame("tcp", "tcp"))
-# A delay estimate whose sigma exceeds this, s, is shown as not measured.
+# An estimate of the wrench's delay is shown as not measured if its sigma exceeds this, s.
 _MEASURED_S = 0.03
 
 
@@ -92,7 +92,7 @@ class Peaks:
     low: Array = field(default_factory=lambda: np.full(6, np.inf))
     high: Array = field(default_factory=lambda: np.full(6, -np.inf))
     sizes: Array = field(default_factory=lambda: np.zeros(2))
-    """(2,) largest norms of force and torque, N and N·m."""
+    """(2,) largest norms of force and torque since the last reset, N and N·m."""
 
     def add(self, wrench: Array) -> None:
         """Extend the extremes by the wrenches (n, 6) of samples."""

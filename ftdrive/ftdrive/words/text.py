@@ -46,7 +46,7 @@ def as_typed(text: str) -> str:
     """Return a message whose commands begin with `uv run` if `uv run` has started this program."""
     return (
         _COMMAND.sub("uv run ftdrive ", text) if "UV_RUN_RECURSION_DEPTH" in os.environ else text
-    )  # set by `uv run`
+    )  # uv run sets this variable
 
 
 def is_command(line: str) -> bool:
@@ -89,7 +89,7 @@ class TextLine:
     """A line of text with its style."""
 
     head: str
-    """A mark or an indent; wrapped lines continue below the first word after it."""
+    """A mark or an indent before the text; wrapped lines continue below the first word after it."""
     words: str
     style: str = ""
-    """Style for rich, on a terminal with colour."""
+    """Style in the notation of the package rich, such as "bold red", for a terminal with colour."""
