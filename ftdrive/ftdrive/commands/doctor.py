@@ -37,7 +37,7 @@ from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import answer, indented, messages, working
 from ftdrive.terminal.text import echo
 
-# Names of the checks by which the summary stands for robot, sensor and noise; for others, it is the first passed one.
+# The summary shows these checks for robot, sensor and noise; for other subjects, it shows the first that passed.
 _HEADLINES = ("robot.identity", "sensor.identity", "noise.accuracy")
 _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "red"), "skipped": ("-", "")}
 

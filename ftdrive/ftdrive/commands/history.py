@@ -19,7 +19,7 @@ from ftdrive.terminal.console import answer, indented, messages
 from ftdrive.terminal.text import echo, print_table
 from ftdrive.words.history import DAY_TITLES, day_row, last_weighing_in_words, result_table, temperature_lines
 
-# Fewer runs cannot make three pairs, so trends of the bias are skipped, and numpy, which is slow, is not imported.
+# Fewer runs make no three pairs for the bias's change per hour, so it is skipped to avoid the slow import of numpy.
 _FEWEST_RUNS = 4
 _HOUR = "bias, {sensor_serial}: changes by {force_N:.2g} N, {torque_Nm:.2g} N·m per axis within an hour (1 sigma)"
 _MOUNTED = ("sensor_serial", "arm_serial", "mount")

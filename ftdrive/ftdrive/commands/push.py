@@ -104,7 +104,7 @@ def push(
             return
     answer.print(f" ✔ Read back: {settings_in_words(read_back)}")
     answer.print(" Programs made on the pendant set the values of their installation: enter them there too.")
-    if saved.exists():  # that of an emulated cell is deleted
+    if saved.exists():  # the run of an emulated cell is deleted
         answer.print(f" Receipt {saved}; undo: ftdrive push --restore {shlex.quote(str(saved))}")
 
 

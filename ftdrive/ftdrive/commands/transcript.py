@@ -81,7 +81,7 @@ def _record_bytes(sensor: str, path: Path, duration_s: float, *, kept: bool = Tr
         "url": url,
         "duration_s": duration_s,
         "utc": datetime.now(UTC).isoformat(),
-        "t_ns": clock.now_ns(),  # the time of `utc` on the clock of the lines
+        "t_ns": clock.now_ns(),  # the moment `utc` on the clock that gives the times of all lines
         "versions": versions(),
     }
     writer = Writer(path, header, clock)

@@ -46,7 +46,7 @@ class ExportFormat:
     notes: tuple[str, ...] = ()
     """Sentences about what the user of the target must know, with the names of values in braces."""
     elsewhere: Mapping[str, str] = field(default_factory=dict)
-    """Values that the user must set in another file of the target, by their names there; "$name" as in `content`."""
+    """Values that the user must set in another place of the target, by their names there; "$name" as in `content`."""
 
     @property
     def has_own_reading(self) -> bool:

@@ -279,7 +279,7 @@ class Exported:
     notes: tuple[str, ...]
     """Sentences about what the user of the target must know."""
     elsewhere: Mapping[str, JSON]
-    """Values that the user must set in another file of the target, by their names there."""
+    """Values that the user must set in another place of the target, by their names there."""
     max_force_error_N: float
     """Largest difference, N, of the target's compensation from that of ftdrive, for a free tool in any orientation."""
     max_torque_error_Nm: float

@@ -208,7 +208,7 @@ class Recorder(Sink):
                         self._convert(self._files, grown, path)
 
     def _convert(self, files: RecordingFiles, grown: Path, path: Path) -> None:
-        """Convert the file `grown` to the format of `path`, then delete it. After a failure it stays: `OSError`."""
+        """Convert the file `grown` to `path`, then delete it. If that fails, raises `OSError`, and `grown` stays."""
         files.saved.remove(grown)
         try:
             write_recording(path, RecordingReader(grown))

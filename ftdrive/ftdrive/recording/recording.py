@@ -250,7 +250,7 @@ class AnyRecording(Protocol):
         """Reason why the file ends early, known once it is read to its end; empty if the recording is complete."""
 
     def blocks(self) -> Iterator[Measured]:
-        """Yield all samples in blocks, from the start at each call. Damage raises an error after the valid blocks."""
+        """Yield all samples in blocks; each call starts again. Damage raises an error after the last valid block."""
 
 
 def with_calibration(header: Header, calibration: CalibrationResult, name: str) -> Header:
@@ -340,7 +340,7 @@ class Recording(Displayed):
 
 
 def next_header(header: Header, event: StreamEvent) -> Header:
-    """Return the header after an event, which may change the frame or stages. An unknown stage is a `BadRecording`."""
+    """Return the header after an event, which may change frame or stages. Raises `BadRecording` for unknown stages."""
     if event.kind == "frame":
         return replace(header, frame=_frame_from_dict(event.values))
     return replace(header, stages=_stages_of(event.values)) if event.kind == "stages" else header

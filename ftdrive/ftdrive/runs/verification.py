@@ -215,7 +215,7 @@ class Verified:
 
     @property
     def update(self) -> "Update | None":
-        """Smallest update of the calibration that explains the poses; None if not needed or not sufficient."""
+        """Smallest update of the calibration that explains the poses; None if no update is needed or none suffices."""
         return self.verification.update
 
     def next_command(self, saved: Path | None, again: str = "") -> str:

@@ -11,7 +11,7 @@ from ftdrive.store.records import StoredResult
 if TYPE_CHECKING:
     from ftdrive.store.trends import QuantityTrend
 
-# Age, in days, above which a calibration that was not verified since gives a warning.
+# A calibration gives a warning if it was neither made nor successfully verified within this number of days.
 OLD_DAYS: Final = 30.0
 OTHER_TEMPERATURE_K: Final = 10.0
 # Smallest number of results of a tool for which trends are estimated.

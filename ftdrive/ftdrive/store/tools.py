@@ -29,7 +29,7 @@ class Tool:
     temperature: BiasTemperature | None = None
     """Dependence of the sensor's bias on temperature; None unless it was shown to predict the bias of other runs."""
     hour_change: Array | None = None
-    """(6,) standard deviation of the bias change in one hour, N and N·m; None if there are too few runs to tell."""
+    """(6,) standard deviation of the bias change in one hour, N and N·m; None if there are too few runs."""
 
 
 def calibration_of_tool(

@@ -196,7 +196,7 @@ class Table:
             self._find()
 
     def _find(self) -> None:
-        """Recognise the signals, and find the factors of their units from names and first rows."""
+        """Recognise the table's signals, and the factors of their units, from the columns' names and first rows."""
         find, options = self._columns.find, self.options
         orientation = find(*(_AXES if options.euler else _ORIENTATIONS))
         self._found = {

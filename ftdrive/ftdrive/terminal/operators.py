@@ -115,7 +115,7 @@ class JsonOperator(_Keyless):
 
 
 class PlainOperator(_Keyless):
-    """Operator that reads plain lines on stderr, without colours or keys; for `verbose`, see `SessionText`.
+    """Operator to whom plain lines are written on stderr, without colours or keys; for `verbose`, see `SessionText`.
 
     With `quiet`, lines are printed only before the next question, which may refer to them.
     """

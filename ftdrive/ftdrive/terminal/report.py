@@ -73,7 +73,7 @@ def _result_table(result: CalibrationResult, truth: Mapping[str, Any] | None, *,
     table = Table(box=None, padding=(0, 1))
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
-            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may fold
+            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # wrap only the names
     for key, axis, *texts in estimate_rows(data, truth):
         if key in _DERIVED and not every:
             continue

@@ -26,7 +26,7 @@ from ftdrive.words.stream import NO_MASS, ShownWrench, StreamSummary, View, wort
 from ftdrivers.interfaces import Array
 from ftdrivers.ur.kinematics import forward
 
-# The page's plots are redrawn at every n-th drawing. A plot is about 250 pixels wide, two pixels per column.
+# Plots are redrawn only at every fifth drawing of the page. A plot is about 250 pixels wide, two pixels per column.
 _PLOT_EACH, _COLUMNS, _EVENTS = 5, 128, 30
 # The arm is redrawn only if a joint has moved by more than this.
 _STILL_RAD = 1e-4

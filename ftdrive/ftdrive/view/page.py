@@ -107,7 +107,7 @@ def _valid_value(control: Part, value: object) -> object:
 
 @contextmanager
 def drawing(page: Page, draw: Callable[[], None], say: Callable[[str], object] = log.error) -> Iterator[None]:
-    """Draw the page 22 times per second in a thread while the block runs. An error ends the drawing; `say` gets it."""
+    """Draw a page 22 times per second in a thread while the block runs. An error ends this; `say` receives it."""
     ended = threading.Event()
 
     def run() -> None:
