@@ -41,7 +41,7 @@ _closed_terminals: list[int] = []
 def _closed_pipe() -> Iterator[None]:
     try:
         yield
-    except BrokenPipeError as error:  # for which click would always exit with code 1
+    except BrokenPipeError as error:  # left to click, it would always give exit code 1
         from ftdrive.terminal.supervisor import Supervisor
 
         if any(Supervisor(sys.stdin, stream, "it").absence() for stream in (sys.stdout, sys.stderr)):
@@ -201,7 +201,7 @@ def run(arguments: Sequence[str]) -> int:
         if not _closed_terminals:
             raise
         code = 1
-    if _closed_terminals:  # the cause of other errors
+    if _closed_terminals:  # report this, because other errors follow from it
         _say("error: the terminal was closed")
         return exit_code(SupervisorGone("")) or code
     return code

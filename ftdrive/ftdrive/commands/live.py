@@ -123,7 +123,7 @@ def live(
             checks = [check_weighed_payload(payload_kg, stream.info.calibration, mass_kg)]
             recorder = lambda path: Recorder([path], stream.info, stream.cell.to_dict())  # noqa: E731
         feed = Feed(stream, recorder)
-        if source.simulate:  # push by a wrench in sensor axes
+        if source.simulate:  # wrench: N and N·m, sensor axes
             feed.push = partial(stream.station.control, do="push", wrench=[0.0, 0.0, -8.0, 0.0, 0.0, 0.0], seconds=1.0)
         title = "ftdrive live" if replay is None else f"ftdrive live, replay of {replay.name}"
         if (page := stack.enter_context(view.page(title))) is not None:

@@ -404,7 +404,7 @@ class SourceOptions(NamedTuple):
     def open(
         self, stack: ExitStack, frame: "WrenchFrame", track: "Tracking" = "off", stages: Mapping[str, Any] = {}
     ) -> "Stream":
-        """Open the chosen stream with these stages until `stack` closes; print the calibration's state, warnings."""
+        """Open the chosen stream with `stages`, to be closed with `stack`; print its calibration and warnings."""
         from ftdrive.terminal.console import messages
 
         calibration = self.calibration()
@@ -419,7 +419,7 @@ class SourceOptions(NamedTuple):
         return stream
 
     def require_alone(self, others: Mapping[str, object]) -> None:
-        """Raise `ConfigError` if an option excluded by --raw, for a sensor alone, is given: its own or in `others`."""
+        """Raise `ConfigError` if --raw (a sensor alone) excludes a given option, one of these or of `others`."""
         own = {"--calibration": self.path, "--tool": self.tool, "--robot": self.described.robot}
         if given := [option for option, value in {**own, **others}.items() if value]:
             raise ConfigError(
@@ -522,7 +522,7 @@ def _checked_stages(_context: click.Context, _parameter: click.Parameter, text: 
             raise ConfigError(f"--stages has no setting '{name}': give NAME=VALUE with one of {', '.join(STAGE_TEXTS)}")
         try:
             found[name] = checked_value(name, parsed_json(value))
-        except ValueError:  # no JSON, so a text
+        except ValueError:  # a value that is no JSON is a text
             found[name] = checked_value(name, value)
     return found
 

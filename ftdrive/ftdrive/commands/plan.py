@@ -159,7 +159,7 @@ def plan_command(
         cell = replace(cell, clock=emulated.clock)
     described = {found[key].origin for key in ("tool.cylinders_mm", "workcell.planes_mm", "workcell.boxes_mm")}
     described -= {"default", "--tool", "--plane", "--box"}
-    if not described:  # no file gives cylinders, planes or boxes
+    if not described:  # cylinders, planes and boxes are from options only
         cell = replace(cell, workcell=replace(cell.workcell, measured=True))
     if not cell.workcell.measured:
         messages.print(

@@ -201,7 +201,7 @@ def _show_result(
         write_json({"source": str(source), "hints": found, **result.to_dict()})
     else:
         print_result(result, drift=drift_check(records) if records else None, records=records, every=every)
-        if not click.get_current_context().params["simulate"]:  # else the run is temporary
+        if not click.get_current_context().params["simulate"]:  # a simulated run is deleted
             messages.print_next(*_next_commands(result, source, output))
     _save(result, output, force, as_json)
 

@@ -63,7 +63,7 @@ def _emulated_address(sensor: str | None) -> str:
 
 
 def _record_bytes(sensor: str, path: Path, duration_s: float, *, kept: bool = True) -> tuple[str, dict[str, Any]]:
-    """Record a sensor's bytes; return its address for the driver, and what this received. If `kept`, print the path."""
+    """Record a sensor's bytes; return its address and what the driver received. If `kept`, print the file's name."""
     # before an emulated sensor starts
     if sensor.startswith("ur-ft:") or sensor == f"{EMULATED}ur-ft":
         raise ConfigError(

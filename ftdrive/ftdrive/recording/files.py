@@ -51,7 +51,7 @@ def format_of(path: Path) -> _RecordingFormat:
 
 
 def grown_as(path: Path) -> Path:
-    """Return the file to which a stream is written: an MCAP file first if the format is unreadable until complete."""
+    """Return the file to write a stream to: `path`, or an MCAP file if its format is unreadable until complete."""
     return path if format_of(path).new.grows else path.with_name(f"{path.name}.mcap")
 
 

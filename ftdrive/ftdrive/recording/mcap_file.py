@@ -79,7 +79,7 @@ _HEAD: Final = np.dtype(
 _NONE: Final = np.zeros(0, np.int64)
 
 
-# Times (n,), sequence numbers, and n messages for each topic; messages of one time are written one after the other.
+# Messages to write: times (n,), sequence numbers, and n messages per topic; those of one time follow each other.
 _Group = tuple[NDArray[np.int64], ArrayLike, Mapping[str, ros2.Messages]]
 
 

@@ -196,7 +196,7 @@ def sensor_identity(origin: Mapping[str, Any]) -> dict[str, JSON]:
 
 
 def identity_mismatch(sensor: "SensorMatrix", identity: Mapping[str, JSON]) -> str:
-    """Return a clause with why a sensor matrix does not belong to a sensor identity; empty if it does."""
+    """Return why a matrix does not belong to the sensor with this identity, as part of a sentence; "" if it does."""
     theirs = sensor.provenance.get("sensor")
     if not isinstance(theirs, Mapping):
         return "it was saved without the model and the range of its sensor: run `ftdrive loads solve` again"

@@ -154,7 +154,7 @@ class Database:
                 self._file.parent.mkdir(parents=True, exist_ok=True)
         with self._connected("written") as connection:
             if self._is_sqlite:
-                connection.exec_driver_sql("BEGIN IMMEDIATE")  # a deadlock if two read first
+                connection.exec_driver_sql("BEGIN IMMEDIATE")  # locks now: writers that read first block
             else:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _WRITERS})
             if self._version(connection) != SCHEMA:

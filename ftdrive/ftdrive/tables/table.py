@@ -56,7 +56,7 @@ _POSE_STEPS_S: Final = (0.5, 1e3)
 _AT_REST_RAD: Final = float(np.radians(0.2))
 # If at least this share of a table's rows is at rest, the arm stopped at poses, and the other rows are moves.
 _MOSTLY: Final = 0.9
-# A direction closer than this to straight up is turned over about a fixed horizontal axis, as any one will do.
+# A gravity vector this close to straight up is turned down about x, because any horizontal axis would do.
 _UPSIDE_DOWN = 1e-9
 
 

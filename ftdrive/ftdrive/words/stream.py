@@ -330,7 +330,7 @@ class StreamSummary:
                 for history in self._histories.values():
                     history.clear()
         rows = Block.concatenate([before, block]) if before is not None and goes_on else block
-        # drop later times too: after a jump back in a recording, samples read earlier have them
+        # Also drop samples with later times, which remain from before a jump back in a replayed recording.
         since_ns = t_ns[-1] - round(MEAN_S * 1e9)
         self._recent = rows.rows((since_ns < rows.t_host_ns) & (rows.t_host_ns <= t_ns[-1]))
         self._peaks.add(block.wrench)
