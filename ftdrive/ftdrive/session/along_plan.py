@@ -35,7 +35,7 @@ _COMPLETED = "completed.ndjson"
 
 
 def has_completed(arm_serial: str, plan_sha256: str) -> bool:
-    """Return whether this arm completed this plan before; False without a serial number, which identifies the arm."""
+    """Return whether this arm completed this plan before; always False if the arm reports no serial number."""
     path = user_folder("state") / _COMPLETED
     if arm_serial == NOT_REPORTED or not path.is_file():
         return False
@@ -46,7 +46,7 @@ def has_completed(arm_serial: str, plan_sha256: str) -> bool:
 
 
 def remember_completed(arm_serial: str, plan_sha256: str) -> None:
-    """Record that one session made every move of the plan, slowly, and took every pose."""
+    """Record in the user's state folder that this arm completed this plan: every move and pose in one slow session."""
     path = user_folder("state") / _COMPLETED
     path.parent.mkdir(parents=True, exist_ok=True)
     line = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256, "utc": datetime.now(UTC).isoformat()}
@@ -63,7 +63,7 @@ def _parse_entry(line: str) -> dict[str, object]:
 
 
 class _SafetyQuestions:
-    """Asks about the free tool, free space, emergency stop and reduced mode; raises `Declined` if an answer is no."""
+    """Asks about free tool, free space, emergency stop and reduced mode; raises `Declined` if one is not confirmed."""
 
     def __init__(self, before: Before) -> None:
         self._arm, self._journal = before.cell.arm, before.cell.journal
@@ -71,7 +71,7 @@ class _SafetyQuestions:
         self._reduced = False  # whether the operator has confirmed that reduced mode is active
 
     def ask(self, way_rad: Array, *, assumed: bool) -> None:
-        """Ask all questions before the arm moves along `way_rad` (k, 6); with `assumed`, `--yes` may answer."""
+        """Ask all safety questions before the arm moves along `way_rad` (k, 6); with `assumed`, `--yes` may answer."""
         room = "" if self._plan.arm_rests else ", and the space around the whole arm, which moves too,"
         if arm_moves(way_rad):
             room = f", and the space around the whole arm, which moves in the approach ({turns_in_words(way_rad)}),"
@@ -130,14 +130,14 @@ class AlongPlan:
         records = [] if session.resumed is None else session.resumed.records()
         kept = {record.stop: record for record in records if record.stop not in self.options.redo}
         self.taken = len(kept)
-        """Number of poses that the resumed run already has."""
+        """Number of poses of the resumed run that are not taken again; 0 in a new run."""
         self.todo = [stop for stop in plan.stops if stop not in kept]
-        """Remaining stops, in order."""
+        """Numbers of the stops, from 1, that this session still has to take, in order."""
         self.judge = self.task.judge(by_hand=False)
         for record in kept.values():
             cell.journal.show(self.judge.add(record))
         self.before = self._look(certifier, plan)
-        """Everything known before the first motion, with the plan at its original speeds."""
+        """Input of the preflight checks; its plan still has the planned speeds, not those chosen for this session."""
         run_checks(self.before, CHECKS)
         if self.options.dry_run:
             cell.note("the controller's safety limits are not checked: only a program on the controller can do that")
@@ -157,7 +157,7 @@ class AlongPlan:
     def _certifier(self) -> Certifier:
         arm, load = self.cell.arm, self.task.load
         if not self.options.dry_run and arm.status().tcp_offset is None:
-            # An old controller reports the flange pose only to a program.
+            # An old controller reports its TCP, and with it the flange pose, only to a program that runs on it.
             arm.open(control=True)
         info, hook_m = arm.identify(), None if load is None else load.p_flange_m
         return certifier_for(self.task.cell, info.model, kinematics_of(info), hook_m)
@@ -199,7 +199,7 @@ class AlongPlan:
         """Ask the safety questions, then guard the cell during the block; yield the guarded cell and the pose book.
 
         `driven` has the speeds and the sampling of this session. `quiet_std` (6,) is the standard deviation of the
-        samples from the resting sensor, and `predict` is as in `Judge`. The `onlookers` are called after the guards.
+        resting sensor's samples, and `predict` is as in `Judge`. The `onlookers`, guards too, are called last.
         """
         cell, options, before, way = self.cell, self.options, self.before, self.before.approach.way_rad
         load = _range_guard(before)
@@ -220,7 +220,7 @@ class AlongPlan:
         )
 
         def on_trip(trip: guards.Tripped) -> None:
-            with suppress(SupervisorGone):  # the event is recorded, and the tour asks the operator next
+            with suppress(SupervisorGone):  # the event is recorded all the same, and the drive then asks the operator
                 cell.journal.show(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
         watcher = Watcher(cell, rows, on_trip)
@@ -231,7 +231,7 @@ class AlongPlan:
                 if before.certifier.arm.hung is not None:
                     words = "Is the weight off the tool? You hang it when the arm is at the first pose."
                     cell.journal.require(words, assumed=before.known and not options.real)
-                questions.ask(way, assumed=before.known and not arm_moves(way))  # a moving approach is new
+                questions.ask(way, assumed=before.known and not arm_moves(way))  # this approach was never driven before
             run = self._session.resumed or self._keep_plan()
             book = PoseBook(cell, run, self.judge, before.certifier.scene.down_base)
             guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)
@@ -254,7 +254,7 @@ class AlongPlan:
         return run
 
     def _recheck(self, questions: _SafetyQuestions, asks: bool) -> None:
-        """Repeat the checks after a stop, and with `asks` also all safety questions."""
+        """Repeat the preflight checks after a stop, and if `asks` is true also all safety questions."""
         before, q = self.before, self.cell.arm.state().q_rad
         # The next approach is checked later, when its goal is known.
         stays = plan_approach(before.certifier, q, q, SLOW)

@@ -36,7 +36,7 @@ SLOW: Final = Speeds.first_run()
 AT_RAD: Final = float(np.radians(0.5))
 # An approach that comes closer than this to a skipped posture is reported as passing it.
 _NEAR_RAD: Final = float(np.radians(10))
-# Time for which the guards watch the resting arm before it moves on after a stop.
+# Time, s, for which the guards watch the resting arm before it moves on after a stop.
 _LOOK_AGAIN_S: Final = 0.4
 _FIRST_WORD: Final = "MOVE"
 
@@ -51,27 +51,27 @@ class Progress:
 
     poses: int
     todo: list[int] = field(default_factory=list)
-    """Remaining stops, in order."""
+    """Numbers of the stops that are still to be taken, in order."""
     stood_at: int | None = None
     """Index of the last pose at which the arm stood; None if something else has moved the arm since."""
     standing: bool = False
     """Whether the arm still stands at the pose `stood_at`."""
     under_way: int | None = None
-    """Stop to which the arm moves, or at which it measures."""
+    """Number of the stop to which the arm moves, or at which it measures; None otherwise."""
     back: tuple[int, str] | None = None
-    """Index of the pose to which the arm should return, and the cause of the stop."""
+    """Index of the pose to which the arm must return, and the cause of its stop on the way; None for no return."""
     confirmed: bool = False
     """Whether the operator has typed the word that starts the first motion."""
     taken_last: int | None = None
-    """Stop of the last pose taken."""
+    """Number of the stop at which the last pose was taken; None before the first."""
     skipped: set[int] = field(default_factory=set)
     """Indices of the skipped poses, whose postures the arm should avoid."""
     reopened: set[int] = field(default_factory=set)
-    """Stops at which the sensor was reopened."""
+    """Numbers of the stops at which a failed sensor was reopened."""
     driven: set[int] = field(default_factory=set)
     """Indices of poses from which the arm has completed the planned move to the next pose."""
     payload_kg: float | None = None
-    """Payload of the controller at the last comparison with the identified mass, kg."""
+    """Payload set in the controller when it was last compared with the identified mass, kg; None before that."""
 
     @property
     def stops(self) -> int:
@@ -96,11 +96,11 @@ class Progress:
 
     @property
     def undriven(self) -> list[int]:
-        """Numbers of the poses, counted from 1, whose next planned move was skipped or replaced by an approach."""
+        """Numbers, from 1, of the poses from which the planned move to the next pose has not been completed."""
         return [index + 1 for index in range(self.poses) if index not in self.driven]
 
     def index(self, stop: int) -> int:
-        """Return the index of the pose at a stop."""
+        """Return the index, from 0, of the pose at a stop, whose number counts from 1."""
         return (stop - 1) % self.poses
 
     def lose_place(self) -> None:
@@ -119,7 +119,7 @@ class Progress:
         self.skipped.discard(self.index(stop))
 
     def skip(self) -> list[int]:
-        """Leave out the next pose and any return to it; return the skipped stops."""
+        """Leave out the next pose and any return to it; return the numbers of the skipped stops."""
         index = self.index(self.todo[0])
         dropped = [stop for stop in self.todo if self.index(stop) == index]
         self.todo = [stop for stop in self.todo if stop not in dropped]
@@ -128,7 +128,7 @@ class Progress:
 
 
 class _OperatorStop(Exception):
-    """Raised when the operator paused, stopped, sent the arm back or answered no; the arm then holds."""
+    """Raised when the operator presses a key that stops the arm, or does not confirm a motion; the arm then holds."""
 
     def __init__(self, words: str, *, for_good: bool = False) -> None:
         super().__init__(words)
@@ -159,14 +159,14 @@ class GuardedCell:
         self._contact, self._recheck = contact, recheck
         self._sensor_events = SensorEvents(cell.sensor, cell.journal.show)
         self._cause: Tripped | None = None  # why the arm holds
-        self._answered: Tripped | None = None  # last row 11 stop after which the safety questions were answered
+        self._answered: Tripped | None = None  # last emergency or safeguard stop after which the operator answered
 
     def show_new(self) -> None:
-        """Show new events of the sensor."""
+        """Show the events of the sensor, such as a reconnection, that were not shown yet."""
         self._sensor_events.show_new()
 
     def cause(self, error: Exception, *, moving: bool) -> Tripped | None:
-        """Return the trip that caused an error: a guard's, or one with the matching hazard; None if there is none."""
+        """Return the trip of the guard that caused an error, or a new one for its hazard; None if no hazard fits."""
         self.watcher.unseen = False
         self._cause = self._row_of(error, moving=moving)
         if self._cause is not None:
@@ -174,14 +174,14 @@ class GuardedCell:
         return self._cause
 
     def require_answers(self) -> None:
-        """Raise the last row 11 stop, however short, unless the safety questions were answered after it."""
+        """Raise the last emergency or safeguard stop unless the safety questions were answered after it."""
         self.watcher.look_aside()
         stop = self.watcher.safety_stop
         if stop is not None and stop is not self._answered:
             raise stop
 
     def reopen(self) -> None:
-        """Reopen the arm and the sensor; raise if the cause persists. Only the operator clears a safety-system stop."""
+        """Reopen arm and sensor after a stop; raise if its cause persists. Only the operator clears a safety stop."""
         self.watcher.look_aside()
         unseen = self.watcher.unseen
         try:
@@ -199,7 +199,7 @@ class GuardedCell:
             self._contact.forget()
             self._sensor_events = SensorEvents(self.cell.sensor, self.cell.journal.show)
         stop = self.watcher.safety_stop
-        if stop is not None and stop not in {self._answered, self._cause}:  # a stop while the arm was already holding
+        if stop is not None and stop not in {self._answered, self._cause}:  # the safety system stopped a holding arm
             self._cause = stop
             self.cell.journal.show(GuardTripped(hazard=stop.hazard, words=str(stop)))
         elif unseen:
@@ -276,7 +276,7 @@ class Drive:
         self._options, self._numbers, self._obey = options, numbers, obey
 
     def obey_keys(self) -> None:
-        """Obey the pressed keys: r refers to the last pose taken, s to the pose in progress, as on the screen.
+        """Obey the pressed keys: r retakes the last pose taken, s skips the pose in progress, as the screen shows.
 
         Every key stops a moving arm and takes effect after the stop. Keys are read before the screen shows another
         pose.
@@ -325,7 +325,7 @@ class Drive:
         raise _OperatorStop(f"back at pose {index + 1}; cause of the stop: {why}")
 
     def _passed(self, way: Array, goal: int) -> list[str]:
-        """Return the numbers of the skipped poses that an approach (k, 6) passes closely."""
+        """Return the numbers of the skipped poses that an approach through postures (k, 6) passes closely."""
         share = np.linspace(0.0, 1.0, 181)[:, None]
         points = np.concatenate([start + share * (end - start) for start, end in pairwise(way)])
         return [
@@ -457,6 +457,6 @@ class Drive:
         return True
 
     def show_state(self, state: State, stop: int | None = None, words: str = "") -> None:
-        """Show the state of the session, and the stop to which it refers."""
+        """Show the state of the session, with the number of the stop to which the state refers."""
         number = None if stop is None else self._numbers[self.now.index(stop)]
         self.journal.show(StateChanged(state=state, stop=stop, stops=self.now.stops, number=number, words=words))

@@ -46,7 +46,7 @@ class Hazard(IntEnum):
     WRONG_PLAN = 25
     DISK_FULL = 26
     SUPERVISOR_GONE = 27
-    """Neither an operator nor a supervising program follows the session any more."""
+    """Neither an operator nor a supervising program can see the session any more."""
 
 
 SCHEMA_VERSION = 1
@@ -70,7 +70,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Event:
-    """Base class of all events."""
+    """Base class of the events that a session shows and records."""
 
     t_utc: str = field(default_factory=lambda: datetime.now(UTC).isoformat())
 
@@ -99,9 +99,9 @@ class StateChanged(Event):
     stop: int | None = None
     """Number of the stop in the tour, from 1; the last stop is the return to the first pose."""
     stops: int | None = None
-    """Number of stops in the tour."""
+    """Number of stops in the tour, including the return to the first pose."""
     number: int | None = None
-    """Number of the orientation."""
+    """Number of the orientation in the plan; None without one."""
     words: str = ""
     """Cause of a STOP or HOLD; otherwise what is happening or what to do."""
 
@@ -118,7 +118,7 @@ class Checked(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Planned(Event):
-    """All motion to come; shown before the first question."""
+    """Plan and approach, which are all the motion to come; shown before the first question."""
 
     plan: Plan
     """The plan; `to_dict` gives the contents of its file."""
@@ -143,7 +143,7 @@ class Noted(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseTaken(Event):
-    """A pose is on disk."""
+    """A pose has been measured and is on disk."""
 
     stop: int
     stops: int
@@ -153,7 +153,7 @@ class PoseTaken(Event):
     mean: Array
     """(6,) mean of the samples as measured, N and N·m."""
     sigma: Array
-    """(6,) standard deviation of the mean, N and N·m."""
+    """(6,) standard deviation of that mean, N and N·m."""
     samples: int
     settle_s: float
     average_s: float
@@ -176,9 +176,9 @@ class MotionRecorded(Event):
     file: str
     duration_s: float
     samples: int
-    """Number of samples from the sensor."""
+    """Number of wrench samples from the sensor."""
     states: int
-    """Number of states reported by the arm."""
+    """Number of arm states (joint angles and flange pose) that the controller reported."""
     temperature_C: float | None = None
     """Temperature that the sensor reports; None if it does not."""
 
@@ -195,14 +195,14 @@ class Estimated(Event):
     residual_sigma: float | None
     """Largest residual of the newest pose over the six channels, each divided by its standard deviation."""
     residual_force_N: float | None
-    """Norm of the residual force of the newest pose."""
+    """Norm of the residual force of the newest pose, N."""
     faces: tuple[int, int, int, int, int, int]
     """Number of poses whose gravity direction is nearest to each flange axis: +x -x +y -y +z -z."""
     cond9: float
     cond_u1: float
     """Condition numbers of the poses; see `ftcalib.poses.information.Prediction`."""
     empty_cap_deg: float
-    """Largest angle from any direction to the nearest direction of gravity among the poses."""
+    """Largest gap in the coverage: angle from the direction farthest from all gravity directions to the nearest one."""
     light: str
     """Whether the poses suffice: "green", "amber" or "red"."""
     hint: str
@@ -256,7 +256,7 @@ class Asked(Event):
     question: str
     answer: str
     by: Literal["person", "--yes"]
-    """Who answered: the operator, or the option `--yes` with the assumed answer."""
+    """Who answered: "person" for the operator, or "--yes" for the option, which gives the assumed answer."""
 
 
 class SensorEvents:

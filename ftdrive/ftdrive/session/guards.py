@@ -24,7 +24,7 @@ from ftdrivers.interfaces import ArmState, ArmStatus
 
 G_M_S2: Final = 9.81
 _SLIDER: Final = 0.02
-# On a curve, a joint that has turned by this angle makes progress.
+# On a curve, the arm has made progress once a joint has turned by this angle.
 _PROGRESS_RAD: Final = 1e-3
 
 
@@ -52,26 +52,26 @@ class Limits:
     """Largest allowed distance of a moving joint from the planned path in joint space."""
     flange_m: float = 0.002
     flange_rad: float = float(np.radians(0.2))
-    """Largest allowed deviation of the flange from the arm's own kinematics; twice the limit of the driver at rest."""
+    """Largest deviation of the reported flange pose from this arm's own kinematics; twice the limit of its driver."""
     nominal_m: float = 0.020
     nominal_rad: float = float(np.radians(3.0))
-    """Largest allowed deviation from nominal kinematics. Real arms deviate by up to 7.5 mm and 1.3 degrees."""
+    """Largest deviation of the flange pose from a model's nominal kinematics. Real arms deviate by 7.5 mm and 1.3°."""
     lag_s: float = 0.008
-    """Delay between the joint angles and the flange pose of one state."""
+    """Largest delay between the joint angles and the flange pose of one reported state."""
     sensor_age_moving_s: float = 0.1
     sensor_age_holding_s: float = 0.5
-    """Longest time without a new sample while the arm moves, and while it stands."""
+    """Longest time without a new sample of the sensor: while the arm moves, and while it stands."""
     frozen_samples_s: float = 0.2
-    """Longest time for which all samples may be equal."""
+    """Longest time for which all samples of the sensor may be equal."""
     saturation: float = SATURATION
-    """Largest allowed share of the sensor's range."""
+    """Largest share of the sensor's range that a reading may reach."""
     contact_N: float = 8.0
     contact_Nm: float = 0.8
     contact_sigmas: float = 5.0
-    """The contact limit is `contact_N` or `contact_Nm`, or this number of standard deviations of noise if larger."""
+    """The contact limit is `contact_N` or `contact_Nm`, or this number of noise standard deviations if larger."""
     unknown_N: float = 15.0
     unknown_Nm: float = 1.5
-    """Added to twice the weight of the heaviest tool until the running fit is reliable."""
+    """Contact limit until the running fit is reliable, in addition to twice the weight of the heaviest tool."""
     low_pass_Hz: float = 20.0
     skew_s: float = 0.03
     """Largest time between a wrench and the pose of the arm with which it is compared."""
@@ -79,27 +79,27 @@ class Limits:
     look_s: float = 0.01
     """Period of the guards, s."""
     counted_s: float = 0.02
-    """Upper bound on the time counted between observations, so that a pause of this process trips no other guard."""
+    """Most time that a guard counts between two observations, so that a pause of this process trips no other guard."""
     aside_s: float = 0.05
-    """Period at which the safety status is read while no motion is watched."""
+    """Period, s, at which the safety status is read while the guards watch no motion."""
     blind_s: float = 1.0
     """Time without a status after which an emergency stop may have been pressed and released unnoticed."""
     hung_s: float = 1.0
     """Time without an observation after which the guards are considered hung."""
     slow_stop_s: float = 0.2
-    """A stop that takes longer is reported before it has ended. A responsive arm brakes from 60 deg/s in 0.2 s."""
+    """A stop that takes longer than this is reported before it ends. A responsive arm brakes from 60 °/s in 0.2 s."""
     link_usual_s: float = 0.02
-    """Largest median response time of the arm. Waiting for the next state takes up to 8 ms."""
+    """Largest median response time of the arm; waiting for its next state is up to 8 ms of it."""
     link_asked_s: float = 0.04
-    """Added to the limit for a controller that reports its TCP only to a program: two requests, usually 24 ms."""
+    """Added to `link_usual_s` if the controller reports its TCP only to a program: two requests, usually 24 ms."""
     link_gap_s: float = 0.1
-    """Response time that nine of ten answers must not exceed."""
+    """Response time of the arm that nine of ten answers must not exceed."""
     program_ends_s: float = 1.5
-    """Time-out for the program of an earlier session: after a killed session it ends by itself within 0.5 s."""
+    """Time-out for the end of an earlier session's program, which ends by itself 0.5 s after its session was killed."""
 
     @classmethod
     def of(cls, clock: Clock) -> Self:
-        """Return the limits for a cell with this clock. The clock of an emulated cell may run ahead of its slow arm."""
+        """Return the limits for a cell with this clock; those of time are wider if an emulated clock leads its arm."""
         usual = cls()
         return cls(link_usual_s=usual.link_usual_s + clock.lead_s, stalled_s=clock.patience_s(usual.stalled_s))
 
@@ -164,21 +164,21 @@ class Guard(ABC):
 
 @dataclass
 class SupervisorGuard(Guard):
-    """Row 27: an operator, or a program in their place, follows the session."""
+    """Guards against hazard 27: trips if no operator, or program in their place, follows the session."""
 
     absence: Callable[[], str | None]
     """Returns why no operator follows, or None, like `Operator.absence`."""
 
     def look(self, seen: Seen) -> None:
         """Trip if the operator is absent."""
-        del seen  # an observation does not show whether an operator follows
+        del seen  # an observation of the arm does not show whether an operator follows
         if why := self.absence():
             raise Tripped(Hazard.SUPERVISOR_GONE, SupervisorGone(why))
 
 
 @dataclass
 class PathGuard(Guard):
-    """Rows 2 and 21: moving joints stay on the straight line or curve to the goal, other joints rest."""
+    """Guards against hazards 2 and 21: trips if a moving joint leaves the planned path, or a resting one moves."""
 
     limits: Limits
 
@@ -205,7 +205,7 @@ class PathGuard(Guard):
 
 @dataclass
 class StallGuard(Guard):
-    """Row 22: the arm makes progress during a move, however slowly."""
+    """Guards against hazard 22: trips if the arm makes no progress during a move; slow progress is allowed."""
 
     limits: Limits
     _nearest_rad: float = field(default=np.inf, init=False)
@@ -240,7 +240,7 @@ class StallGuard(Guard):
 
 @dataclass
 class SliderGuard(Guard):
-    """Row 22 in a sweep: trips if the operator moves the speed slider, which does not act on a sweep."""
+    """Guards against hazard 22 in a sweep: trips if the speed slider, without effect on a sweep, is moved."""
 
     _before: float | None = field(default=None, init=False)
 
@@ -262,7 +262,7 @@ class SliderGuard(Guard):
 
 @dataclass
 class ModelGuard(Guard):
-    """Rows 8 and 9: the reported flange pose matches the kinematics of the arm model."""
+    """Guards against hazards 8 and 9: trips if the reported flange pose contradicts the kinematics of the arm."""
 
     limits: Limits
     certifier: Certifier
@@ -293,7 +293,7 @@ class ModelGuard(Guard):
 
 @dataclass
 class SettingsGuard(Guard):
-    """Rows 7 and 8: the payload and the TCP do not change."""
+    """Guards against hazards 7 and 8: trips if the payload or the TCP set in the controller changes."""
 
     _before: ArmStatus | None = field(default=None, init=False)
 
@@ -325,7 +325,7 @@ class SettingsGuard(Guard):
 
 @dataclass
 class SafetyGuard(Guard):
-    """Rows 7, 10, 11, 12 and 21: no stop of the safety system, and the control program keeps running."""
+    """Guards against hazards 7, 10, 11, 12 and 21: trips on a safety stop, or if the control program ends."""
 
     _mode: str | None = field(default=None, init=False)
 
@@ -334,7 +334,7 @@ class SafetyGuard(Guard):
         self._mode = seen.status.safety_mode
 
     def look(self, seen: Seen) -> None:
-        """Trip on every stop, every change of the safety mode, and every pause or end of the program."""
+        """Trip on every stop, every change of the safety mode, and every pause or end of the control program."""
         status = seen.status
         if status.fault is not None:
             raise by_safety(status, f"the arm stopped: {status.fault}")
@@ -359,7 +359,7 @@ class SafetyGuard(Guard):
 
 @dataclass
 class SensorGuard(Guard):
-    """Row 15: the sensor sends new samples, and their values change."""
+    """Guards against hazard 15: trips if the sensor sends no new samples, or samples that never change."""
 
     limits: Limits
     _sample: int = field(default=-1, init=False)
@@ -400,13 +400,13 @@ class SensorGuard(Guard):
 
 @dataclass
 class RangeGuard(Guard):
-    """Row 13: no axis comes near the end of its range; without a known range, only the sensor's status shows that."""
+    """Guards against hazard 13: trips if an axis is near the end of its range; never if the range is unknown."""
 
     limits: Limits
     range: Array | None
     """Largest wrench (6,) of the sensor, N and N·m; None if it is unknown."""
     zero: Array = field(default_factory=lambda: np.zeros(6))
-    """Reading (6,), N and N·m, from which the range is measured if the zero of the sensor is arbitrary."""
+    """Reading (6,), N and N·m, from which the range is counted: not 0 if the zero of the sensor is arbitrary."""
 
     def look(self, seen: Seen) -> None:
         """Check the newest sample."""
@@ -429,7 +429,7 @@ class RangeGuard(Guard):
 
 @dataclass
 class ContactGuard(Guard):
-    """Rows 14 and 1: the sensor carries only the weight of the tool."""
+    """Guards against hazards 14 and 1: trips if the sensor carries more than the weight of the tool."""
 
     limits: Limits
     heaviest_kg: float
@@ -440,14 +440,14 @@ class ContactGuard(Guard):
     quiet_std: Array
     """Standard deviation (6,) of the samples from the resting sensor."""
     predict: Callable[[Array], Array | None] = lambda _: None
-    """Returns the wrench (6,) of the free tool at an orientation (3, 3); None while it is unknown."""
+    """Returns the wrench (6,) of the free tool at a flange orientation (3, 3), or None while that is unknown."""
     _start: Array | None = field(default=None, init=False)
     _sample: int = field(default=-1, init=False)
     _residual: Array | None = field(default=None, init=False)
     _turns_rad_s: list[float] = field(default_factory=list, init=False)
 
     def begin(self, seen: Seen) -> None:
-        """Use the first wrench of the session for the free tool; after a stop the contact may still exist."""
+        """Use the session's first wrench as that of the free tool, and no later one: contact may outlast a stop."""
         if self._start is None:
             self._start = seen.wrench
         self._residual = None
@@ -502,7 +502,7 @@ class ContactGuard(Guard):
 
 
 def arm_lost(error: DeviceError, *, moving: bool) -> Tripped:
-    """Return the trip for row 16: the arm reports no state. A moving arm may not receive the stop either."""
+    """Return the trip for hazard 16, an arm that reports no state; if it moves, it may not receive a stop either."""
     if not moving:
         return Tripped(Hazard.CONTROLLER_LOST, error)
     found = (
@@ -513,7 +513,7 @@ def arm_lost(error: DeviceError, *, moving: bool) -> Tripped:
 
 
 def by_safety(status: ArmStatus, words: str) -> Tripped:
-    """Return the trip for row 7, 10, 11 or 12: the safety system has stopped the arm; `words` describe the stop."""
+    """Return the trip for hazard 7, 10, 11 or 12, a stop by the safety system; `words` describe the stop."""
     mode = status.safety_mode
     if mode == "protective stop":
         payload = "" if status.payload_kg is None else f" (payload set: {status.payload_kg:.2f} kg)"

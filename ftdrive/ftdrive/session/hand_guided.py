@@ -26,18 +26,18 @@ from ftdrivers.interfaces import ArmState, FtSamples
 # Standstill before a pose, s on the controller's clock, judged by joint speeds: in freedrive `is_steady` is false.
 STILL_S: Final = 1.0
 STILL_RAD_S: Final = 0.002
-# A rotation of the flange below this is a nudge, not a move.
+# The arm counts as moved to another pose if the flange has rotated by more than this.
 LEFT_RAD: Final = radians(1)
 REPEAT_RAD: Final = radians(10)
-# Largest angle between the first pose of a program and the pose after its return there.
+# Largest angle between the first pose of a program and a pose that counts as its return there.
 RETURN_RAD: Final = radians(0.1)
 LOOK_S: Final = 0.1
 # Time-out for an arm or sensor that is lost, s; a driver that reconnects gives up after 10 s.
 BACK_S: Final = 12.0
-# A pose that differs from the fit of the others by more than both limits was probably disturbed by contact.
+# A pose that differs from the fit of the others by more than both of these was probably disturbed by contact.
 SURPRISE_SIGMA: Final = 5.0
 SURPRISE_N: Final = 0.5
-# Smallest number of poses for the comparison of a new pose with the fit of the others, including the new one.
+# A new pose is compared with the fit of the others once there are this many poses, including the new one.
 LEAST_TO_COMPARE: Final = 6
 
 T = TypeVar("T")
@@ -56,19 +56,19 @@ class _Moved(Exception):
 
 
 class _Held:
-    """Arm and sensor as `take_pose` uses them, for an arm that already stands still."""
+    """Gives `take_pose` the interface of arm and sensor that it needs, for an arm that already stands still."""
 
     def __init__(self, state: Callable[[], ArmState], collect: Callable[[float], FtSamples]) -> None:
         self._state, self._collect = state, collect
         self._before: ArmState | None = None
         self.samples: FtSamples | None = None
-        """Samples of the last dwell; None before the first."""
+        """Samples that the sensor collected last; None before the first collection."""
 
     def wait_until_still(self, **_: object) -> None:
         self._before = None
 
     def state(self) -> ArmState:
-        """Return the state; raises `_Moved` if the arm has moved since the first call."""
+        """Return the arm's state; raises `_Moved` if the arm has moved since the measurement began."""
         state = self._state()
         if self._before is None:
             self._before = state
@@ -81,7 +81,7 @@ class _Held:
         return self.samples
 
     def check(self) -> None:
-        """Do nothing: the stream is checked on each reading."""
+        """Do nothing, because `collect` already raises if the stream of the sensor is interrupted."""
 
 
 def take_by_hand(session: OpenSession) -> Run:
@@ -146,20 +146,20 @@ class HandGuided:
         self._redo: int | None = None
         self._light = "red"
         self._paused = False
-        # State in which the arm stopped; None while it moves.
+        # State reported when the arm came to rest; None while it moves.
         self._rests_at: ArmState | None = None
         self._still_since_s = 0.0
         # Whether the pose at which the arm stands was taken or left out.
         self._dealt_with = False
         self._program_ran = False
-        # State of the program as the controller reports it; empty before the program starts.
+        # State of the pendant's program as the controller reports it; empty before the program starts.
         self._program = ""
-        # Whether the program passed its first pose before the poses sufficed, as a restarted program does.
+        # Whether the program came back to its first pose before there were enough poses, as when it is restarted.
         self._passes_first = False
         self._fault: str | None = None
         self._over = False
         self._ends_by_itself = not (listen or cell.journal.has_keys)
-        # Whether the light is green and the newest pose is good.
+        # Whether the poses suffice: their coverage is green and the newest pose is good.
         self._enough = False
 
     def run(self, earlier: Sequence[PoseRecord], goal: str) -> None:

@@ -27,21 +27,21 @@ from ftdrive.cell.config import USUAL_KG
 from ftdrive.runs.load import Load
 from ftdrive.session.events import Estimated
 
-# Limits of green, as for gravity directions 50 to 60 degrees apart; see `ftcalib.poses.information.Prediction`.
+# Largest condition numbers of green coverage, as for gravity directions 50 to 60 degrees apart; see `Prediction`.
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
-# Limits of amber, as for gravity directions 30 to 45 degrees apart.
+# Largest condition numbers of amber coverage, as for gravity directions 30 to 45 degrees apart.
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
-# A run with a load is judged by cond_u1 alone: a hanging load limits the tilt, and the tool-only run covers cond9.
+# With a load, coverage is judged by cond_u1 alone: a hanging load limits the tilt, and the tool-only run gives cond9.
 OF_A_LOAD = ("cond_u1",)
-# Largest tilt in a hint while a load hangs from the tool, with a margin for rounding.
+# Largest tilt of the tool in a suggested pose while a load hangs from it, with a margin for rounding.
 HUNG_TILT_RAD = float(np.radians(76))
-# A running fit is reliable if the sigma of its force is at most this share of the weight.
+# A running fit is reliable if the sigma of the force that it predicts is at most this share of the weight.
 TRUSTED_SHARE = 0.05
 
 
 def free_wrench(result: CalibrationResult, R_base_flange: Array) -> Array:
     """Return the reading (6,), N and N·m, of the sensor with a free tool at an orientation R_base_flange (3, 3)."""
-    # The matrix that decodes contacts is left out, because the guards compare readings.
+    # The sensor matrix, which decodes contacts, is not applied, because the guards compare readings as measured.
     compensator = Compensator(result.parameters, response=result.response)
     return np.asarray(-compensator(np.zeros(6), R_base_flange), dtype=np.float64)
 
@@ -49,8 +49,8 @@ def free_wrench(result: CalibrationResult, R_base_flange: Array) -> Array:
 class RunningFit:
     """Calibration from the poses so far, and the coverage of these poses.
 
-    `down_base` (3,) is the unit vector down in base until the fit estimates it. With `advise` the estimates suggest the
-    most useful next pose. A known `load` is part of what the sensor carries.
+    `down_base` (3,) is the unit vector down in base axes, used until the fit estimates it. With `advise` each estimate
+    suggests the most useful next pose. A known `load` on the tool is part of what the sensor carries.
     """
 
     def __init__(
@@ -220,7 +220,7 @@ def _pointing_down(gravity_flange: Array) -> str:
 
 
 def _light(coverage: Prediction, *, loaded: bool = False) -> str:
-    """Return the light from the conditioning; never green with few poses or if another solution explains them."""
+    """Return the light for a coverage; never green with few poses, or if a second solution fits them as well."""
     values = {"cond9": coverage.cond9, "cond_u1": coverage.cond_u1}
     if loaded:
         values = {name: values[name] for name in OF_A_LOAD}
@@ -231,7 +231,7 @@ def _light(coverage: Prediction, *, loaded: bool = False) -> str:
 
 
 def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[float, float] | None:
-    """Return the residual of a new pose in the fit of the earlier poses: worst channel in sigmas, force norm in N."""
+    """Return a new pose's residual from the fit of earlier poses: worst channel in sigmas, norm of the force in N."""
     if result is None:
         return None
     R_base_flange = record.before.R_base_flange
@@ -242,7 +242,7 @@ def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[flo
 
 
 def _values_and_sigmas(result: CalibrationResult) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-    """Return estimates and sigmas by name; `drift`, if there is one, is last pose minus first, (6,) N and N·m."""
+    """Return estimates and sigmas by name; `drift` (6,), N and N·m, is the reading after the return minus the first."""
     sigma = dict(result.sigma)
     values = {name: getattr(result, name) for name in sigma}
     if result.drift is not None:

@@ -52,7 +52,7 @@ class SessionOptions:
     name: str = "calibrate"
     poses: int = 24
     sets: str | None = None
-    """Sets of orientations of Yu's Fig. 6, such as A+E; they replace `poses`."""
+    """Sets of orientations, such as A+E, by the letters of Fig. 6 in Yu's paper; they replace `poses`."""
     method: Method = "ml"
     """Method that solves a calibration from its poses."""
     mode: Mode = "auto"
@@ -62,11 +62,11 @@ class SessionOptions:
     """Move at the speeds of the plan if this arm has completed the plan slowly before."""
     plan: Path | None = None
     output: Path | None = None
-    """New file for the plan."""
+    """New file in which the plan is also saved; None for none."""
     png: Path | None = None
-    """New PNG file for a drawing of the plan."""
+    """New PNG file in which the plan is drawn; None for none."""
     watch: Callable[[Certifier, RangeGuard], Guard] | None = None
-    """Called before the first question; returns a guard that only observes and never trips."""
+    """Called before the first question; returns a further guard, which only observes and never trips."""
     resume: Path | None = None
     redo: tuple[int, ...] = ()
     real: bool = True
@@ -77,7 +77,7 @@ class SessionOptions:
     seconds: float = 20.0
     """Duration of a sweep at the planned speed, or maximum duration of a passive calibration."""
     description: Mapping[str, Any] = field(default_factory=dict)
-    """Further entries of run.json."""
+    """Entries that are added to run.json."""
 
     @property
     def by_hand(self) -> bool:
@@ -126,7 +126,7 @@ class Journal:
         self._absence_recorded = False
 
     def keep_in(self, run: Run) -> None:
-        """Record all events in this run, including those already shown."""
+        """Record all events in the folder of this run from now on, and those that were shown before."""
         with self._lock:
             self._run = run
             for event in self._early:
@@ -155,12 +155,12 @@ class Journal:
             return
         try:
             self._run.append_event(event.to_dict(), sync=sync)
-        # An event may be lost; a pose that cannot be written raises elsewhere.
+        # A lost event does not end the session; a pose that cannot be written does, in `Run.commit`.
         except OSError as error:
             log.warning("events.ndjson cannot be written: %s", error)
 
     def absence(self) -> str | None:
-        """Return why no operator follows; None if one does."""
+        """Return why no operator follows the session; None if one does."""
         return self._operator.absence()
 
     def require_operator(self) -> None:
@@ -181,7 +181,7 @@ class Journal:
 
     @contextmanager
     def reporting_early_end(self, run: Run) -> Iterator[None]:
-        """Show where the data of a run are if the block raises."""
+        """If the block raises, show where the data of the run are; then raise the error again."""
         try:
             yield
         except BaseException:
@@ -189,9 +189,9 @@ class Journal:
             raise
 
     def ask(self, question: Question) -> str:
-        """Ask a question; record the answer and who gave it. Raises `SupervisorGone`, even if `--yes` would answer."""
+        """Ask; record the answer and who gave it. Raises `SupervisorGone` without an operator, even with `--yes`."""
         assumed = question.assumed if self._yes else None
-        with self.recording_absence():  # the guards record no absence while the arm stands
+        with self.recording_absence():  # while the arm stands, no guard runs that would record the absence
             self.require_operator()
             try:
                 answer = self._operator.ask(question) if assumed is None else assumed
@@ -213,12 +213,12 @@ class Journal:
         return self._operator.has_keys
 
     def pressed(self) -> Key | None:
-        """Return the last key pressed; None if there is none."""
+        """Return the oldest pressed key that was not returned before; None if there is none."""
         return self._operator.pressed()
 
     @property
     def pressed_by(self) -> str:
-        """Return who pressed the last key."""
+        """Return who pressed the key that `pressed` returned last."""
         return self._operator.pressed_by
 
 
@@ -233,11 +233,11 @@ class OpenCell:
     limits: Limits
 
     def note(self, words: str, *, warning: bool = False) -> None:
-        """Show a note."""
+        """Show and record a note for the operator."""
         self.journal.show(Noted(words=words, warning=warning))
 
     def listen(self, duration_s: float) -> FtSamples:
-        """Collect samples from the resting sensor; reopen a failed sensor once, as after a killed session."""
+        """Collect samples while the arm rests; a sensor that fails, as after a killed session, is reopened once."""
         try:
             return self.sensor.collect(duration_s)
         except DeviceError as error:
@@ -248,14 +248,14 @@ class OpenCell:
 
 
 class Judge(Protocol):
-    """Judges the poses taken so far."""
+    """Judges the poses taken so far, by a running fit or by comparison with a calibration."""
 
     @property
     def weighed_kg(self) -> float | None:
         """Mass that the sensor carries, kg; None while it is uncertain."""
 
     def add(self, record: PoseRecord) -> Estimated | Compared:
-        """Add a pose, which replaces one with the same `stop`; return the new estimate or comparison."""
+        """Add a pose, which replaces one with the same `stop`; return the new estimate, or the comparison."""
 
     def remove(self, stop: int) -> None:
         """Remove the pose at a stop before it is taken again; ignore a stop without a pose."""
@@ -292,13 +292,13 @@ class Task(Protocol):
         """Condition under which hand-guided poses suffice, as a clause without a full stop."""
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
-        """Return a plan that starts near joint angles (6,). Raises `PlanRefused`."""
+        """Return a plan that starts near joint angles (6,). Raises `PlanRefused` if no suitable plan is found."""
 
     def judge(self, *, by_hand: bool) -> Judge:
-        """Return the judge of the poses; `by_hand` means that no plan chooses them."""
+        """Return a new judge of the poses; `by_hand` means that no plan chooses the poses."""
 
     def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
-        """Describe the accuracy to expect if each average has standard deviations `sigma` (6,); empty if unknown."""
+        """Describe the accuracy to expect if each pose's average has the sigmas `sigma` (6,); empty if unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -309,11 +309,11 @@ class OpenSession:
     task: Task
     options: SessionOptions
     resumed: Run | None
-    """The run that is continued."""
+    """The run that is continued; None for a new run."""
     plan: Plan | None
     """The plan to follow; None if it is made later from the posture of the arm."""
     new_run: Callable[[], Run]
-    """Creates the folder of a new run."""
+    """Creates the folder of a new run and returns the run."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -327,7 +327,7 @@ class PoseBook:
     """(3,) unit vector down, base axes, from the configured mounting."""
 
     def keep(self, record: PoseRecord, *, stops: int, settle_s: float, average_s: float) -> Estimated | Compared:
-        """Commit and show a pose; return the new estimate or comparison."""
+        """Write a pose to disk and show it; return the new estimate, or the comparison with a calibration."""
         # Each pose is on disk before the arm moves on: a crash costs only the pose in progress.
         record = self.run.commit(record)
         self.cell.journal.show(

@@ -18,15 +18,15 @@ from ftdrive.session.open_session import OpenCell, OpenSession
 from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 
-# Duration of the first fit's data, s; each later fit uses 25 % more.
+# Duration of the recording at the first fit, s; each later fit follows when the recording is 25 % longer.
 FIRST_S: Final = 10.0
 LONGER: Final = 1.25
 # Shortest useful recording, s.
 LEAST_S: Final = 5.0
-# Time between two files, s: the most that a power failure can lose.
+# Duration of the recording in each file, s; a power failure loses no more than this.
 PART_S: Final = 1.0
 _READ_S: Final = 0.2
-# Silence of a device that ends the recording, s; a shorter one is only a gap.
+# A device that sends nothing for this time ends the recording, s; after a shorter time there is only a gap.
 _SILENT_S: Final = 10.0
 # Number of consecutive good fits that end the recording.
 GOOD: Final = 2
@@ -46,8 +46,8 @@ def record_passively(
     """Record the free tool in motion until two consecutive fits are good, the operator presses q, or time is up.
 
     Each second of data is on disk before the next. Each fit is shown with its sigmas and with the missing motion. The
-    fits run in a thread of `fits`, so a lost device is noticed at once and raises `DeviceError`; the recording
-    so far is in the run. Raises `Declined` if the operator ends the recording in the first seconds.
+    fits run in a thread of `fits`, so a lost device is noticed during a fit too and raises `DeviceError`; the run has
+    the recording so far. Raises `Declined` if the operator ends the recording before it is long enough for a fit.
     """
     # Every sample is kept, not only sums, so that the run can be solved again with a new search for contact.
     cell.note(f"Recording for at most {seconds:.0f} s; nothing is commanded. Keep the tool free for part of the time.")

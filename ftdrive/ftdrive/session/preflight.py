@@ -33,8 +33,8 @@ from ftdrivers.clock import Clock
 from ftdrivers.interfaces import FtSamples, RobotArm
 
 LISTEN_S: Final = 2.0
-# Step between points checked against the safety limits, about 10 ms per point. Between two points the arm deviates from
-# their chord by at most 1 mm.
+# Step between the points of a move that are checked against the safety limits; a check takes about 10 ms. Between two
+# points the flange deviates from the straight line through them by at most 1 mm.
 _EDGE_RAD: Final = float(np.radians(5))
 # A plan is made for rounded joint angles, and the joint angles of a resting arm have noise of about 2e-5 rad.
 _ROUNDED_RAD: Final = float(np.radians(1))
@@ -49,7 +49,7 @@ class Before:
     certifier: Certifier
     plan: Plan
     approach: Approach
-    """Approach to the first remaining pose."""
+    """Approach from the present posture to the first remaining pose."""
     runs: Path
     known: bool
     """Whether this arm has completed the plan before, which means that its controller has accepted every move."""
@@ -72,7 +72,7 @@ class Before:
 
     @property
     def sensor_zero(self) -> Array:
-        """Reading (6,) from which the range is measured: the one at rest if the sensor's zero is arbitrary, else 0."""
+        """Reading (6,) from which the range is counted: that at rest if the sensor's zero is arbitrary, otherwise 0."""
         is_arbitrary = self.cell.sensor.identify().has_arbitrary_zero
         return np.asarray(self.quiet.wrench.mean(axis=0) if is_arbitrary else np.zeros(6))
 
@@ -82,11 +82,11 @@ class SessionCheck:
     """A preflight check."""
 
     name: str
-    """Name of the check in its event."""
+    """Name of the check in the event that shows its result."""
     judge: Callable[[Before], Check]
 
     def __call__(self, before: Before) -> Checked:
-        """Run the check and return its event; a warning does not forbid motion."""
+        """Run the check and return its result as an event; a check that only warns counts as passed."""
         check = self.judge(before)
         words = f"{check.found}: {check.fix}" if check.fix else check.found
         return Checked(name=self.name, passed=check.state != "failed", words=words)
@@ -181,7 +181,7 @@ def _check_approach(before: Before) -> Check:
 def check_cable(before: Before) -> Check:
     """Check that wrist 3 stays within its window about the current angle, at which the cable is not wound up."""
     stands = before.cell.arm.state().q_rad[5]
-    turns = [step.q_rad[5] for step in before.plan.steps]  # an approach stays between these angles
+    turns = [step.q_rad[5] for step in before.plan.steps]  # an approach turns wrist 3 no further than these angles
     low, high = min(turns), max(turns)
     now, least, most = np.degrees([stands, low, high])
     found = f"wrist 3 is at {now:.0f}° and turns between {least:.0f}° and {most:.0f}°"
@@ -208,7 +208,7 @@ def _check_safety_limits(before: Before) -> Check:
 
 
 def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
-    """Return why the controller's safety limits forbid moves through joint vectors (n, 6); empty if they do not."""
+    """Return why the controller's safety limits forbid moves through joint vectors (n, 6); "" if they allow them."""
     for q in _points_along(q_rad, step_rad):
         if not arm.within_safety_limits(q.tolist()):
             return (
@@ -219,7 +219,7 @@ def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
 
 
 def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
-    """Raise `NotAccepted` if a program keeps running on the controller (row 21); a session never stops it."""
+    """Raise `NotAccepted` if a program keeps running on the controller; a session never stops another's program."""
     deadline_s = clock.now_s() + limits.program_ends_s
     while (program := arm.status().program) != "stopped":
         if clock.now_s() > deadline_s:
@@ -232,7 +232,7 @@ def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
 
 _APPROACH: Final = SessionCheck("approach", _check_approach)
 
-# These checks do not need control of the arm.
+# Checks before a session takes control of the arm.
 CHECKS: Final[Sequence[SessionCheck]] = (
     SessionCheck("safety", lambda before: check_safety(before.cell.arm.status())),
     SessionCheck("remote", lambda before: check_remote(before.cell.arm)),
@@ -249,10 +249,10 @@ CHECKS: Final[Sequence[SessionCheck]] = (
     SessionCheck("disk", lambda before: computer.check_disk(before.runs)),
 )
 
-# Checks that need a program on the controller; they follow when all others have passed.
+# Checks that need ftdrive's program on the controller; they follow when all others have passed.
 IN_CONTROL: Final[Sequence[SessionCheck]] = (SessionCheck("limits", _check_safety_limits),)
 
-# Checks before a stopped session goes on. The new approach is checked later, when its goal is known.
+# Checks before a stopped session goes on. Its new approach is checked later, when the goal is known.
 AGAIN: Final[Sequence[SessionCheck]] = (*(row for row in CHECKS if row is not _APPROACH), *IN_CONTROL)
 
 
@@ -266,7 +266,7 @@ def _points_along(q_rad: Array, step_rad: float) -> Array:
 
 
 def run_checks(before: Before, rows: Sequence[SessionCheck]) -> None:
-    """Run checks and show their results; raises `NotAccepted` if one failed."""
+    """Run preflight checks and show their results; raises `NotAccepted` if one failed."""
     found = []
     for row in rows:
         found.append(row(before))
@@ -277,7 +277,7 @@ def run_checks(before: Before, rows: Sequence[SessionCheck]) -> None:
 
 @contextmanager
 def awake() -> Iterator[str]:
-    """Keep the computer from going to sleep if systemd supports it (hazard 18); yield a note for the operator."""
+    """Keep the computer awake during the block if systemd supports it; yield a note that says whether it does."""
     asleep = "this computer may go to sleep: disable sleep during the session"
     tool = shutil.which("systemd-inhibit") if sys.platform == "linux" else None
     if tool is None:

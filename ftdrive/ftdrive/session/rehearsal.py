@@ -45,7 +45,7 @@ class NoOperator:
 
 
 class _Unkept:
-    """Passes events to an operator, except those that name a temporary folder."""
+    """Passes events to an operator, except those whose text names a folder that is temporary."""
 
     def __init__(self, operator: Operator, folder: Path) -> None:
         self._operator, self._folder = operator, str(folder)
@@ -105,8 +105,8 @@ def short_calibration(operator: AbstractContextManager[Operator], sensor: str | 
 
 
 def station_of(calibration: CalibrationResult, sensor: str | None = None) -> Station:
-    """Return the emulated cell of a calibration, not started; `sensor` replaces its sensor."""
-    # A stream pairs samples and poses by the controller's clock, so the cell runs in real time.
+    """Return the emulated cell in which a calibration was made, not yet started; `sensor` replaces its sensor."""
+    # Runs in real time, because a stream pairs samples and poses by the controller's clock.
     return Station.of(calibration.provenance.get("station"), sensor, REAL_PACE)
 
 
@@ -119,7 +119,7 @@ def put_on(station: Station, load: Load) -> None:
         place = list(load.p_flange_mm)
         station.control(do="hang", mass_kg=load.mass_kg, at_mm=place, string_mm=1e3 * STRING_M)
     else:
-        # About midway between the fingers; the solver does not know this position.
+        # About midway between the fingers; the solver is not given this position.
         p_load_m = np.array([0.0, 0.0, TOOL_MM[1] / 1e3 - truth["p_flange_sensor_m"][2]])
         com_m = (truth["mass_kg"] * np.array(truth["p_sensor_com_m"]) + load.mass_kg * p_load_m) / mass_kg
         station.control(do="payload-shift", mass_kg=mass_kg, p_sensor_com_m=com_m.tolist())
@@ -164,9 +164,9 @@ def rehearse_loads(
 
 
 def contact_errors(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:
-    """Return RMS values for a contact of 100 N at the tip, N: force error as read and decoded, and predicted sigma.
+    """Return the RMS force error, N, for contacts of 100 N at the tip: as read, decoded, and as predicted (sigma).
 
-    The mean square is over random directions. The reading comes from the true parameters, not from the solver's model.
+    The mean is over random directions. The readings come from the true parameters, not from the solver's model.
     """
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
     force = CONTACT_N * directions / np.linalg.norm(directions, axis=1, keepdims=True)

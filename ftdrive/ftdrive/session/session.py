@@ -37,18 +37,18 @@ from ftdrive.session.tour import take_tour
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from ftdrivers.registry import Options, split_url
 
-# Options in a sensor's address that select its factory calibration, with their defaults.
+# Options in the address of a sensor that select one of its factory calibrations, with their defaults.
 _CHOOSES_CALIBRATION: Final = {"slot": 0, "calibration": 1}
-# Reported properties of a sensor that depend on its scale or factory calibration.
+# Properties that a sensor reports and that depend on its scale or its factory calibration.
 _OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range", "software_bias")
 
 
 def _require_devices(
     connected: Mapping[str, DeviceInfo], config: SensorConfig, *, calibration: CalibrationResult | None, run: Run | None
 ) -> tuple[str, ...]:
-    """Require the devices of a calibration or of a resumed run; return warnings about what could not be compared.
+    """Check that these are the devices of a calibration or resumed run; return warnings about what was not compared.
 
-    Raises `ConfigError` if arm, sensor or mounting differ from the calibration, and as `_require_same_devices`.
+    Raises `ConfigError` if arm, sensor or mounting differ from the calibration, `PlanRefused` if not those of the run.
     """
     belongs = None if calibration is None else compare_devices(calibration, connected, config.mount)
     if belongs is not None and belongs.others:
@@ -106,9 +106,9 @@ class Calibrating:
     load: Load | None = None
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
-        """Return a tour. Raises `PlanRefused` if the tour lacks orientations that the method needs."""
+        """Return a tour. Raises `PlanRefused` if it lacks orientations that the method of calibration needs."""
         options = self.options
-        # With a hanging load, no approach leads to another full turn of the wrist.
+        # A wrist that is a full turn away is brought back by the approach, but not with a hanging load.
         q_rad = q_rad if certifier.arm.hung else from_usual_wrist(certifier, q_rad)
         plan = plan_for(self.cell, certifier, q_rad, poses, sets=options.sets)
         special = sum(step.number in NUMBERS[24] for step in plan.steps)
@@ -125,12 +125,12 @@ class Calibrating:
         return plan
 
     def judge(self, *, by_hand: bool) -> Judge:
-        """Return the running fit."""
+        """Return a new running fit, which judges the poses of a calibration."""
         down_base = down_of(self.cell.workcell.mounting)
         return RunningFit(g_m_s2=self.cell.site.g_m_s2, down_base=down_base, advise=by_hand, load=self.load)
 
     def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
-        """Describe the predicted sigmas of the result; empty for a new tool, or with a load."""
+        """Describe the predicted sigmas of the result; empty for a new tool on a calibrated sensor, or with a load."""
         if plan.kind == "tool" or self.load is not None:
             return ""
         force_N, torque_Nm = rms_sigma(sigma)
@@ -250,7 +250,7 @@ def _take(session: OpenSession) -> Run | None:
 
 
 def describe_run(task: Task, options: SessionOptions, connected: Mapping[str, DeviceInfo]) -> dict[str, Any]:
-    """Return the contents of run.json."""
+    """Return the entries of run.json that describe task, cell, devices and mode of a session."""
     return {
         "command": task.command,
         "config": task.cell.to_dict(),
@@ -263,7 +263,7 @@ def describe_run(task: Task, options: SessionOptions, connected: Mapping[str, De
 
 
 def method_of_poses(name: str) -> Method:
-    """Return the method of this name. Raises `ConfigError` if it is unknown or needs data other than poses."""
+    """Return the method of this name. Raises `ConfigError` if there is none, or if it needs more than the poses."""
     if name not in get_args(Method):
         raise ConfigError(f"there is no method '{name}': choose one of {', '.join(get_args(Method))}")
     if name == "carlson-cayley":

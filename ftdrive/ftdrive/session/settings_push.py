@@ -33,19 +33,19 @@ from ftdrive.session.preflight import require_no_program
 from ftdrivers.interfaces import ControllerSettings, DeviceInfo, ForceTorqueSensor, Guard, RobotArm
 
 FORMAT: Final = "ftdrive.push/1"
-# Start of the file name of a receipt.
+# Start of the file name of each receipt.
 _RECEIPT: Final = "push"
 # The word that the operator types to send each setting.
 WORDS: Final = {"payload": "PUSH", "gravity": "GRAVITY"}
 
 _STILL_S: Final = 5.0
 _LISTEN_S: Final = 1.0
-# Number of attempts at a steady reading; a steady reading fails the test about once in a hundred times.
+# Number of attempts to obtain a steady reading; a steady one fails the test about once in a hundred times.
 _LISTENS: Final = 3
 # Largest allowed difference between a value sent and the value read back, which both have 64 bits.
 _TOLERANCE: Final = 1e-6
 
-# Asks for the word of a setting, such as "payload"; raises `Declined` if it is not typed.
+# Asks the operator for the word of a setting, such as PUSH for "payload"; raises `Declined` if it is not typed.
 Ask = Callable[[str], None]
 
 
@@ -58,11 +58,11 @@ class Receipt:
     new: ControllerSettings
     devices: Mapping[str, Mapping[str, Any]]
     restores: str | None
-    """Path of the receipt whose old values were restored; None for a push."""
+    """Path of the earlier receipt whose old values this push restored; None for an ordinary push."""
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a receipt, or the newest receipt of a push in a run folder. Raises `BadDataset`."""
+        """Read a receipt, or the newest one in a run folder that restored nothing; raises `BadDataset` on failure."""
         if path.is_dir():
             return cls._newest(path)
         try:
@@ -101,17 +101,17 @@ def _settings(values: Mapping[str, Any]) -> ControllerSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Push:
-    """Settings to send, with the current ones and the comparison that led to the new ones."""
+    """A push to make: the new and the current settings, and the comparison that led to the new ones."""
 
     old: ControllerSettings
     new: ControllerSettings
     """New values; None for each setting that does not change."""
     devices: Mapping[str, DeviceInfo]
     reason: Mapping[str, Any]
-    """Origin of the values, for the receipt."""
+    """Origin of the new values, as the receipt records it."""
     load: FlangeLoad | None = None
     lean: Lean | None = None
-    """Tilt of the base relative to the controller's gravity, or to the configured mounting if that is unknown."""
+    """Tilt of the base relative to the gravity set in the controller, or if unknown, to the configured mounting."""
     contact: Array | None = None
     """(6,) reading minus the reading of a free tool, N and N·m: contact, or drift since the calibration."""
 
@@ -176,7 +176,7 @@ def propose(
 
 
 def _sensor_of(cell: CellConfig) -> tuple[float, float]:
-    """Return mass (kg) and height (m) of the sensor."""
+    """Return mass (kg) and height (m) of the sensor. Raises `ConfigError` if one of them is not configured."""
     mass_kg, height_mm = cell.sensor.mass_kg, cell.sensor.height_mm
     if mass_kg is None:
         raise ConfigError(
@@ -209,7 +209,7 @@ def _wait_until_still(arm: RobotArm) -> None:
 
 
 def _contact_wrench(arm: RobotArm, sensor: ForceTorqueSensor, result: CalibrationResult) -> Array | None:
-    """Return the reading (6,) minus that of a free tool; None if the flange pose is unknown. Raises `NotAccepted`."""
+    """Return reading (6,) minus free-tool reading; None if the pose is unknown. `NotAccepted` if it is not steady."""
     for _ in range(_LISTENS):
         wrench = sensor.collect(_LISTEN_S).wrench
         check = check_level(wrench)
@@ -223,8 +223,8 @@ def _contact_wrench(arm: RobotArm, sensor: ForceTorqueSensor, result: Calibratio
 
 
 def _gravity_to_set(result: CalibrationResult, lean: Lean, old: ControllerSettings) -> tuple[float, ...] | None:
-    """Return the gravity to set, with the magnitude that the controller uses; None if its direction agrees."""
-    # Without a report of the controller's gravity, a change could neither be read back nor be restored.
+    """Return the gravity to set, with its present magnitude; None if the controller's direction already agrees."""
+    # If the controller does not report its gravity, a change could neither be read back nor be restored.
     if old.up_base_m_s2 is None:
         raise NotAccepted(
             f"the base {lean} relative to [workcell] mounting, and this controller does not report its gravity vector, "
@@ -266,7 +266,7 @@ def send(
     DeviceError
         The arm failed. If a setting may have been sent, there is a receipt.
     """
-    # The settings are read back after the program has ended, because only then are they known to remain.
+    # The settings are read back after ftdrive's program has ended, because only then are they known to outlast it.
     disk = computer.check_disk(folder)
     if disk.state == "failed":
         raise NotAccepted(f"no receipt can be written: {disk.found}. Copy the run to another folder; nothing was sent")
@@ -321,7 +321,7 @@ def _set(arm: RobotArm, new: ControllerSettings, guard: Guard) -> None:
 
 
 def _differences(sent: ControllerSettings, read_back: ControllerSettings | None) -> list[str]:
-    """Return the names of the settings that the controller reports with a value other than the one sent."""
+    """Return the names of the settings for which the controller reports a value other than the one sent."""
     back = read_back or ControllerSettings()
     pairs = {
         "mass": (sent.mass_kg, back.mass_kg),

@@ -23,24 +23,24 @@ from ftdrivers.sweep import Sweep
 
 # Duration of the rest that is recorded before and after the sweep, s.
 REST_S: Final = 2.0
-# Time between two points of the curve that the guards use, s.
+# Time step, s, of the points of the curve with which the guards compare the arm.
 CURVE_S: Final = 0.01
 _READ_S: Final = 1.0
-# Share of the planned speed during the first run of a plan.
+# Fraction of the planned speed at which a plan is run for the first time.
 FIRST_SHARE: Final = 0.5
-# Lowest speed slider at which a sweep is useful.
+# Lowest position of the speed slider, 0 to 1, at which a sweep is useful.
 LEAST_SLIDER: Final = 0.5
-# Averaging time for the noise level that the contact guard uses, s.
+# The contact guard uses the noise of the resting sensor within averages of this length, s.
 _QUIET_S: Final = 1.0
-# Assumed mass of the tool if [tool] mass_kg is not set.
+# Assumed upper bound on the mass of the tool if [tool] mass_kg is not set.
 _HEAVIEST_KG: Final = 5.0
-# Duration of motion before the first prediction, s.
+# Duration of motion along the curve, s, before the wrench of the free tool is predicted.
 KNOWN_S: Final = 3.0
-# The fit excludes the newest readings over this time, s, so that a growing contact is not taken for weight.
+# The fit excludes the readings of the last seconds, this many, so that a growing contact is not taken for weight.
 BEHIND_S: Final = 1.0
-# Standard deviation of one reading, including vibration and acceleration.
+# Standard deviation of one force reading in motion, including vibration and inertial force.
 _NOISE_N: Final = 2.0
-# A prediction whose sigma exceeds this is not used.
+# A predicted force whose sigma exceeds this is not used.
 _UNSURE_N: Final = 2.5
 
 
@@ -62,7 +62,7 @@ def take_sweep(session: OpenSession) -> Run | None:
 
 
 def _repeat_until_recorded(drive: Drive, sweep: Sweep, sampling: Sampling, run: Run) -> None:
-    """Move the arm to the centre of the sweep and along the curve; repeat after a stop. Raises as `Tour.run` does."""
+    """Move the arm to the centre and along the curve, again after a stop, until recorded. Raises as `Tour.run` does."""
     now = drive.now
     now.todo = [1]
     drive.watcher.begin()
@@ -166,7 +166,7 @@ class FreeToolPrediction(Guard):
 
     def look(self, seen: Seen) -> None:
         """Add the readings older than `BEHIND_S` to the fit."""
-        # A push that grows over several seconds still partly enters the fit.
+        # A contact force that grows over several seconds still enters the fit in part.
         if seen.motion.curve_rad is not None:
             self._moving_s += seen.dt_s
         if seen.sample == self._sample:
@@ -206,7 +206,7 @@ def on_script_path(cell: CellConfig) -> CellConfig:
 
 
 def _choose_speed(before: Before, *, slow: bool) -> tuple[Before, Sweep]:
-    """Return plan and curve, slowed down as the speed slider now requires. Raises `NotAccepted` if it is too low."""
+    """Return plan and sweep, slowed to the speed slider and on a first run. `NotAccepted` if the slider is too low."""
     cell, slider = before.cell, before.cell.arm.status().speed_slider
     if slider < LEAST_SLIDER:
         raise NotAccepted(

@@ -25,15 +25,15 @@ from ftdrive.session.events import Key, Question, State, Weighed, rms_sigma
 from ftdrive.session.open_session import OpenSession, PoseBook, SessionOptions
 from ftdrive.session.preflight import LISTEN_S, Before
 
-# Target sigma of one average; 24 poses then give a sigma of the force bias of 0.02 N.
+# Target sigma of the average at one pose; 24 poses then determine the force bias with a sigma of 0.02 N.
 _TARGET_N, _TARGET_NM = 0.057, 0.0035
-# Factor on the averaging time for a new tool: its four poses then have the information of eight.
-# Drift acts for twice the time, but four long poses are as accurate as six, with two moves fewer.
+# Factor on the averaging time for a new tool on a calibrated sensor: its four poses then have the information of eight.
+# Drift acts for twice as long, but four long poses are as accurate as six usual ones, with two moves fewer.
 _TOOL_AVERAGES: Final = 2.0
 
 
 def take_tour(session: OpenSession) -> Run | None:
-    """Take the poses of a given plan, or of a plan from the current posture; return the run, None after a dry run."""
+    """Take the poses of the given plan, or of a plan made from the current posture; return None after a dry run."""
     options = session.options
     along = AlongPlan(session, lambda certifier, q_rad: session.task.plan(certifier, q_rad, options.poses))
     driven = _choose_pace(along)
@@ -50,7 +50,7 @@ def take_tour(session: OpenSession) -> Run | None:
 
 
 class _Turned(Exception):
-    """Raised when the operator skips the pose in progress, or takes the last pose again."""
+    """Raised when the operator presses s to skip the pose in progress, or r to take the last pose again."""
 
     def __init__(self, key: Key) -> None:
         super().__init__(key.name)
@@ -102,7 +102,7 @@ class Tour:
 
     @property
     def undriven(self) -> list[int]:
-        """Poses from which the planned move was not driven; see `Progress.undriven`."""
+        """Numbers of the poses from which the planned move was not completed; see `Progress.undriven`."""
         return self._now.undriven
 
     def _next(self) -> None:
@@ -125,7 +125,7 @@ class Tour:
         del self._now.todo[0]
 
     def _compare_payload(self) -> None:
-        """Row 7: show the mass on the sensor, and warn if the controller's payload disagrees; once per payload."""
+        """Hazard 7: show the mass on the sensor, and warn if the controller's payload differs; once per payload."""
         mass_kg = self._book.judge.weighed_kg
         if mass_kg is None:
             return
@@ -139,7 +139,7 @@ class Tour:
             self._note(finding.words, warning=True)
 
     def _step(self, stop: int, index: int) -> bool:
-        """Ask the operator in step mode; return whether to move."""
+        """Ask the operator before a pose in step mode; return whether to move to it."""
         answer = self._journal.ask(
             Question(
                 f"Pose {stop} of {self._now.stops}, orientation {self._plan.steps[index].number:02d}: "
@@ -178,7 +178,7 @@ class Tour:
             self._skip()
 
     def _redoable(self) -> bool:
-        """Return whether r can take the last pose again; if not, a note says why."""
+        """Return whether the key r can take the last pose again; if not, show a note that says why."""
         last = self._now.taken_last
         if last is None:
             self._note("no pose yet: nothing to take again with r")
@@ -195,7 +195,7 @@ class Tour:
         self._note(f"pose {stop} is taken again")
 
     def _skip(self) -> None:
-        """Leave out the next pose and a return to it. A pose that was to be taken again keeps its earlier samples."""
+        """Leave out the next pose and any return to it. A pose that was to be taken again keeps its earlier samples."""
         dropped = self._now.skip()
         names = {stop: "the return to pose 1" if stop == self._now.stops else f"pose {stop}" for stop in dropped}
         stay = set(dropped).intersection(self._book.run.stops())
@@ -252,14 +252,14 @@ class Tour:
         self._now.arrive(index, driven_from=driven_from)
 
     def _own_speed(self, index: int) -> float | None:
-        """Return the planned speed of the move from the current pose to another, rad/s; None if the plan lacks it."""
+        """Return the planned speed, rad/s, of the move from the current pose to another; None if no move is planned."""
         at, n = self._now.at, len(self._nodes)
         if at is None or (index - at) % n not in {1, n - 1}:
             return None
         return self._plan.steps[at if (index - at) % n == 1 else index].speed_rad_s
 
     def _choices(self, back: int | None, fixed: str) -> tuple[str, dict[str, str]]:
-        """Return a sentence about the saved poses, and the answers in a hold with their effects; see `Drive.hold`."""
+        """Return a sentence about the saved poses, and for each answer in a hold its effect; see `Drive.hold`."""
         stop = self._now.todo[0]
         ways = {"resume": f"go on with pose {stop}{fixed}", "skip": f"skip pose {stop}"}
         if back is not None:
@@ -268,7 +268,7 @@ class Tour:
         return f"{len(self._book.run.stops())} poses are saved.", ways
 
     def _obey(self, key: Key) -> str:
-        """Raise `_Turned` for s and r, or return a note about a key without effect."""
+        """Raise `_Turned` for the keys s and r if they have an effect; otherwise return a note on the key, or ""."""
         if (key is Key.SKIP and self._now.under_way is not None) or (key is Key.REDO and self._redoable()):
             raise _Turned(key)
         if key is Key.KEEP:
@@ -277,7 +277,7 @@ class Tour:
 
 
 def _choose_pace(along: AlongPlan) -> Before:
-    """Choose speeds and sampling; show the expected accuracy and duration."""
+    """Return the input of a tour with speeds and sampling for this session; show expected accuracy and duration."""
     before, todo, cell, task, options = along.before, along.todo, along.cell, along.task, along.options
     sampling, sigma = _chosen_sampling(before, todo)
     force_N, torque_Nm = rms_sigma(sigma)

@@ -34,7 +34,7 @@ POSES: Final = 6
 QUICK_POSES: Final = 2
 # A pose closer than this to an orientation of the calibration does not count as new.
 FRESH_RAD: Final = float(np.radians(10))
-# The contact guard uses the calibration after this number of poses, if all their residuals are within the two limits.
+# The contact guard uses the calibration after `HOLDS_POSES` poses, if all residuals are within the other two limits.
 HOLDS_N, HOLDS_NM = 2.0, 0.2
 HOLDS_POSES: Final = 3
 
@@ -52,13 +52,13 @@ class Verifying:
     poses: int
     """Number of new poses to take."""
     runs: Path
-    """Folder of runs; the plan of an earlier verification is reused if it still fits the cell."""
+    """Folder of runs, from which the plan of an earlier verification is reused if it still fits the cell."""
 
     @staticmethod
     def chosen(
         options: SessionOptions, path: Path | None, poses: int | None, limits: Limits
     ) -> tuple[Path | None, Limits, SessionOptions]:
-        """Return calibration, limits and options: the given ones, or those of the resumed run. Raises `ConfigError`."""
+        """Return calibration, limits and options as given, or of the resumed run; `ConfigError` if they conflict."""
         quick, resume = options.fast, options.resume
         if quick and poses is not None:
             raise ConfigError("--quick and --poses are mutually exclusive: leave one of them out")
@@ -80,7 +80,7 @@ class Verifying:
         """Return the task for a calibration file or a run folder. Raises the errors of `read_calibration`."""
         calibration = read_calibration(path)
         path = Run(path).calibration_path if path.is_dir() else path
-        # A noise record of 12 s would take longer than the poses.
+        # Recording the sensor's noise for 12 s would take longer than the few poses of a quick verification.
         if options.fast:
             cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
         return cls(cell, calibration, path, options.poses, options.runs)
@@ -102,13 +102,13 @@ class Verifying:
 
     @cached_property
     def R_fitted(self) -> Array:
-        """Orientations R_base_flange (k, 3, 3) of the calibration; (0, 3, 3) if they are unknown."""
+        """Orientations R_base_flange (k, 3, 3) of the calibration poses; (0, 3, 3) if they are unknown."""
         dataset = fitted_dataset(self.calibration, self.path)
         return np.zeros((0, 3, 3)) if dataset is None else dataset.R_base_flange
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warning if the calibration poses are unknown."""
+        """One warning if the calibration poses are unknown, otherwise none."""
         if len(self.R_fitted):
             return ()
         lost = f"the poses of the calibration are unknown, because its dataset.json is not next to {self.path}"
@@ -125,23 +125,23 @@ class Verifying:
         return plan.marked(measured=self.cell.workcell.measured, emulated=self.cell.is_emulated)
 
     def judge(self, *, by_hand: bool) -> Judge:
-        """Return the comparison of each pose with the calibration."""
+        """Return a new object that compares each pose with the calibration."""
         return RunningComparison(self.calibration, self.R_fitted if by_hand else np.zeros((0, 3, 3)), self.poses)
 
     def forecast(self, _plan: Plan, _certifier: Certifier, _sigma: Array, /) -> str:
-        """Describe the error to expect in an unchanged cell."""
+        """Describe the error of the calibration to expect if the cell has not changed."""
         error_N, error_Nm = self.calibration.likely_error()
         return f"error of the calibration: {error_N:.2g} N, {to_place_of(error_Nm, error_Nm)} N·m"
 
     def _earlier(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan | None:
-        """Return a plan that was driven before and may therefore run fast; None if no plan fits."""
+        """Return the plan of an earlier verification, which may run fast because it was driven; None if none fits."""
         for path in sorted(self.runs.glob("*/plan.json"), reverse=True):
             with suppress(BadPlan, BadDataset, PlanRefused, OSError, KeyError, TypeError):
                 plan = Plan.load(path)
                 turns = np.array([step.q_rad[5] for step in plan.steps]) - q_rad[5]
                 near = (
                     turns.min() <= 0 <= turns.max() or np.abs(turns).max() <= WRIST_6_RAD
-                )  # larger turns would wind up the cable
+                )  # a larger turn of wrist 3 would wind up the cable
                 if plan.kind == "verification" and len(plan.steps) == poses and near and self._is_mine(path.parent):
                     plan.require(certifier)
                     return plan
@@ -167,7 +167,7 @@ class RunningComparison:
         self._fresh: set[int] = set()
 
     def add(self, record: PoseRecord) -> Compared:
-        """Add a pose, which replaces one with the same `stop`; return its comparison."""
+        """Add a pose, which replaces one with the same `stop`; return its comparison with the calibration."""
         self.remove(record.stop)
         R_base_flange = record.before.R_base_flange
         if angle_between(self._R_fitted, R_base_flange).min(initial=np.inf) >= FRESH_RAD:
@@ -192,7 +192,7 @@ class RunningComparison:
         self._fresh.discard(stop)
 
     def predict(self, R_base_flange: Array) -> Array | None:
-        """Return the wrench (6,) of a free tool; None until poses confirm the calibration. Callable from any thread."""
+        """Return a free tool's wrench (6,); None until some poses confirm the calibration. Callable from any thread."""
         seen = [compared.residual for compared in list(self._compared.values())]
         norms = ((np.linalg.norm(residual[:3]), np.linalg.norm(residual[3:])) for residual in seen)
         if len(seen) < HOLDS_POSES or any(force_N > HOLDS_N or torque_Nm > HOLDS_NM for force_N, torque_Nm in norms):
@@ -201,7 +201,7 @@ class RunningComparison:
 
 
 def save_wanted_update(verified: Verified, update: Answer, ask: Callable[[Question], str]) -> Path | None:
-    """Save an available update as a new calibration if the operator wants it; return its path, else None."""
+    """If `verified` has an update and the operator wants it, save it as a new calibration and return the path."""
     if verified.passed or verified.update is None or update == "no":
         return None
     question = Question(f"An update of {verified.updated} is sufficient. Save it as a new calibration?")

@@ -23,26 +23,26 @@ log = logging.getLogger(__name__)
 
 
 class Watcher:
-    """Runs the guards during each `watching` block; at other times it checks for stops of the safety system (row 11).
+    """Runs the guards during each `watching` block; at other times it checks for emergency and safeguard stops.
 
-    `on_trip` is called from the thread when the arm has stopped, or after 0.2 s if the stop takes longer.
+    `on_trip` is called from the guard thread when the arm has stopped, or after 0.2 s if the stop takes longer.
     """
 
     def __init__(self, cell: OpenCell, guards: Sequence[Guard], on_trip: Callable[[Tripped], None]) -> None:
         self.clock, self._limits = cell.clock, cell.limits
         self._arm, self._sensor, self._guards, self._on_trip = cell.arm, cell.sensor, tuple(guards), on_trip
         self._motion: ExpectedMotion | None = None
-        self._seen: ExpectedMotion | None = None  # the last motion that all guards have judged
+        self._seen: ExpectedMotion | None = None  # the motion of which all guards have judged an observation last
         self._wake = threading.Event()
         self._end = threading.Event()
         self._reported = threading.Event()
         self._tripped: Tripped | None = None
         self.report_error: Exception | None = None
-        """Error of reporting the last trip; the hold shows it with the trip."""
+        """Error that occurred when the last trip was reported; the hold shows it with the trip."""
         self.safety_stop: Tripped | None = None
-        """The last emergency or safeguard stop, moving or not; it is kept until the session ends."""
+        """The last emergency or safeguard stop, of a moving or resting arm; kept until the session ends."""
         self.unseen = False
-        """Whether the status was missing so long that a stop may have gone unnoticed; the reader resets this flag."""
+        """Whether the arm reported no status for so long that a stop may be unnoticed; the reader resets this flag."""
         self._blind_since_s: float | None = None
         self._stopped_by_safety = False
         self._judging = threading.RLock()
@@ -61,7 +61,7 @@ class Watcher:
         self._thread.join(timeout=5.0)
 
     def begin(self) -> None:
-        """Forget the last trip, and let the guards take the next observation as their reference."""
+        """Forget the last trip, and let each guard take the next observation as its reference."""
         self._tripped = self.report_error = None
         self._reported.clear()
         self._begun = False
@@ -91,14 +91,14 @@ class Watcher:
         self.check()
 
     def look_aside(self) -> None:
-        """Check for row 11 stops while no motion is watched: a stop may be released before the operator answers.
+        """Check for emergency and safeguard stops while no motion is watched; one may be released before an answer.
 
         Shows nothing, because the screen may show a question.
         """
         with self._judging:
             try:
                 status = self._arm.status()
-            # An arm driver from another package may raise any error; reopening the arm reports the cause.
+            # An arm driver of another package may raise any error; its cause is reported when the arm is reopened.
             except Exception as error:
                 log.debug("the arm reports no status: %r", error)
                 now_s = self.clock.now_s()
@@ -119,7 +119,7 @@ class Watcher:
                 self.safety_stop, self._stopped_by_safety = trip, True
 
     def check(self) -> None:
-        """Raise the trip, or raise one if the guards have ended or hang. Every loop that waits for the arm calls it."""
+        """Raise the current trip, or one if the guards ended or hang. Every loop that waits for the arm calls this."""
         if self._tripped is not None:
             raise self._tripped
         if self._has_ended:
@@ -131,7 +131,7 @@ class Watcher:
             )
 
     def tripped(self, *, wait_s: float) -> Tripped | None:
-        """Return the trip after the arm has stopped and the trip is reported; None if none occurs within `wait_s`."""
+        """Wait for a trip, then until it is reported, and return it; None if no guard trips within `wait_s`."""
         deadline_s = self.clock.now_s() + wait_s
         while self._tripped is None and self.clock.now_s() < deadline_s:
             self.clock.sleep(0.005)
