@@ -21,30 +21,30 @@ from ftdrivers.ur.kinematics import Array
 
 # If no approach is proven clear, the operator must jog every joint to within this angle of the first pose.
 NEAR_RAD = float(np.radians(30))
-# Largest distance of via poses from the joint range between start and end. Joint 6 needs no detour.
+# Via poses may leave each joint's range between start and goal by this much; joint 6 needs no detour.
 ROOM_RAD = np.radians([120.0, 90.0, 100.0, 120.0, 120.0, 0.0])
-# An arm within this angle of the first pose needs no approach.
+# The arm needs no approach if every joint is within this angle, rad, of the first pose.
 AT_RAD = 1e-3
 NODES = 240
 NEIGHBOURS = 16
-# Maximum number of proof rounds, which take about 1 s in total.
+# Maximum number of rounds, each of which certifies the best paths; all together take about 1 s.
 ROUNDS = 80
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """A sequence of k moves that ends at the first pose; k is 0 if the arm is already there."""
+    """A sequence of k joint moves from the current posture to the first pose; k is 0 if the arm is already there."""
 
     way_rad: Array
-    """Joint vectors (k + 1, 6) from the current posture to the first pose; (0, 6) without a move."""
+    """Joint vectors (k + 1, 6) between the moves, from the current posture to the first pose; (0, 6) without a move."""
     speed_rad_s: Array
-    """Speed (k,) of the leading joint in each move."""
+    """Speed (k,) in each move of the joint that turns most."""
     certified: bool
     """Whether every move is proven clear; always true for the result of `plan_approach`."""
     clearance_m: float
-    """Lower bound on the clearance over all moves."""
+    """Lower bound on the smallest distance between bodies over all moves."""
     limited_by: str
-    """The two bodies whose distance comes closest to the margin."""
+    """The two bodies whose distance comes closest to the margin that it must keep."""
 
     @property
     def q_rad(self) -> Array:
@@ -92,7 +92,7 @@ def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, sp
 
 
 def _around(certifier: Certifier, now: Array, first: Array, speeds: Speeds) -> Array:
-    """Return via poses and the first pose (k, 6). Raises `PlanRefused` if no path is proven clear."""
+    """Return the via poses of an approach and its goal (k, 6). Raises `PlanRefused` if no path is proven clear."""
     here = certifier.certify(now, now)
     if not here.clear[0]:
         raise PlanRefused(_too_near(certifier, here) + _where_to_jog(first))
@@ -107,7 +107,7 @@ def _around(certifier: Certifier, now: Array, first: Array, speeds: Speeds) -> A
 
 
 def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Speeds) -> Array | None:
-    """Return via poses and the first pose (k, 6); None if no path is proven clear."""
+    """Return the via poses and the goal (k, 6) of the best path in a roadmap; None if no path is proven clear."""
     nodes = _nodes(certifier, now, first)
     turn = np.abs(nodes[:, None] - nodes)
     cost = move_duration_s(turn.max(axis=2), speeds.joint_rad_s, speeds.joint_rad_s2) + 0.05 * turn.sum(axis=2)
@@ -147,7 +147,7 @@ def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Spe
 
 
 def _nodes(certifier: Certifier, now: Array, first: Array) -> Array:
-    """Return start, goal, and free via poses: corners of the box between the two, and random poses in a larger box."""
+    """Return start, goal and free via poses: corners of the joint-space box between them, and random poses around."""
     corner = (np.arange(1, 63)[:, None] >> np.arange(6)) % 2 == 1
     limit = np.full(6, 2 * np.pi)
     limit[2] = max(ELBOW_RAD, abs(now[2]), abs(first[2]))

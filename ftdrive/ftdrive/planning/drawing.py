@@ -20,14 +20,14 @@ from ftdrivers.installation import missing_extra
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
-# Views: base axis to the right, base axis up, title.
+# Views of the drawing: index of the base axis to the right, index of that upwards, and title.
 VIEWS = ((1, 2, "along base x"), (0, 2, "along base y"), (0, 1, "from above"))
-# A plane is drawn in views along it: the component of its unit normal along the view is below this.
+# A plane is drawn in the views that look along it: its unit normal's component along the view is below this.
 _ALONG = 0.1
-# Every fifth step of a sweep is drawn.
+# Only every fifth step of a sweep is drawn.
 _OF_SWEEP = 5
 _FAR_M = 20.0
-# Largest distance from the arm and the ball to surroundings that are shown, and width of the border.
+# Surroundings are shown up to the first distance from the arm and its ball; the second is the width of the border.
 _NEAR_M, _EDGE_M = 1.0, 0.06
 _TURN = np.linspace(0, 2 * np.pi, 100)
 
@@ -103,7 +103,7 @@ def _plot_joints(axes: Any, sweep: Sweep) -> None:
 
 
 def _title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
-    """Return the title: what the drawing shows, and what it does not."""
+    """Return the title of a drawing, which says what the drawing shows and which planes it does not."""
     ball = f"sphere of {plan.ball_m:.2f} m"
     moves = f"all moving parts stay in this {ball}" if plan.arm_rests else f"wrist and tool stay in this {ball}"
     name = f"EMULATED {certifier.arm.name}" if plan.emulated else certifier.arm.name
@@ -127,7 +127,7 @@ def _skeletons(at: Frames) -> Array:
 
 
 def _tools(arm: ArmModel, at: Frames, view: list[int]) -> Iterator[Array]:
-    """Yield the outline (k, 2) of every cylinder of the tool at every pose, m."""
+    """Yield the outline (k, 2) of every cylinder of the tool at every pose, as seen in one view, m."""
     for flange_m, R in zip(at.flange_m, at.R_base_flange, strict=True):
         for part in arm.tool:
             points = (flange_m + _rims(part) @ R.T)[:, view]
@@ -153,7 +153,7 @@ def _view_corners(plan: Plan, poses: Frames, before: Array, scene: Scene) -> Arr
 
 
 def _surroundings(axes: Any, scene: Scene, view: list[int]) -> None:
-    """Draw boxes, and the planes that lie along the view."""
+    """Draw the boxes of a scene, and its planes that lie along the view."""
     for box in scene.boxes:
         (left, bottom), (right, top) = np.array([box.low_m, box.high_m])[:, view]
         axes.fill([left, right, right, left], [bottom, bottom, top, top], color="tab:red", alpha=0.3)

@@ -9,13 +9,13 @@ from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrivers.ur.kinematics import Array
 
 SAMPLE_RAD = np.radians(0.5)
-# A joint that turns by less than this is considered at rest: no part of any arm then moves by 20 mm.
+# A joint that turns by less than this counts as resting, because no part of any arm then moves by 20 mm.
 STILL_RAD = float(np.radians(0.5))
 
 
 @dataclass(frozen=True, slots=True)
 class Speeds:
-    """Limits of every move: speed and acceleration of the leading joint, and speed of the tool tips."""
+    """Limits of every move: speed and acceleration of the joint that turns most, and speed of the tool tips."""
 
     joint_rad_s: float = float(np.radians(60))
     joint_rad_s2: float = float(np.radians(80))
@@ -33,7 +33,7 @@ class Speeds:
         return cls(float(np.radians(15)), float(np.radians(20)), 0.1)
 
     def limited(self, other: "Speeds") -> "Speeds":
-        """Return the smaller value of each limit."""
+        """Return limits that keep both these and the other limits: the smaller value of each."""
         return Speeds(
             min(self.joint_rad_s, other.joint_rad_s),
             min(self.joint_rad_s2, other.joint_rad_s2),
@@ -42,14 +42,14 @@ class Speeds:
 
 
 def move_duration_s(turn_rad: Array, speed_rad_s: Array | float, acceleration_rad_s2: float) -> Array:
-    """Return the duration of moves by the angle of the leading joint, with a trapezoidal speed profile, s."""
+    """Return the duration of moves, s, from the angle of the joint that turns most; trapezoidal speed profile."""
     ramp = np.square(speed_rad_s) / acceleration_rad_s2
     whole = turn_rad / speed_rad_s + np.asarray(speed_rad_s) / acceleration_rad_s2
     return np.asarray(np.where(turn_rad > ramp, whole, 2 * np.sqrt(turn_rad / acceleration_rad_s2)))
 
 
 def speed_of_leading_joint(arm: ArmModel, start_rad: Array, end_rad: Array, speeds: Speeds) -> Array:
-    """Return the largest speed (m,) of the leading joint in straight moves (m, 6) within all limits, rad/s."""
+    """Return the speed (m,), rad/s, that the joint that turns most may have in straight moves (m, 6) within limits."""
     turn = end_rad - start_rad
     leading = np.abs(turn).max(axis=1)
     speed = np.full(len(turn), speeds.joint_rad_s)
@@ -81,7 +81,7 @@ def durations_s(arm: ArmModel, q_rad: Array, speeds: Speeds) -> Array:
 
 
 def tips(arm: ArmModel, q_rad: Array) -> Array:
-    """Return the centres (n, k, 3) of the far ends of the tool's cylinders, and the hook of a load, in base, m."""
+    """Return points (n, k, 3) in base, m: centres of the far ends of the tool's cylinders, and a load's hook."""
     at = arm.frames(q_rad)
     hook = [] if arm.hung is None else [arm.hung.p_flange_m]
     local = np.array([*((part.x_m, part.y_m, part.to_m) for part in arm.tool), *hook])
@@ -89,6 +89,6 @@ def tips(arm: ArmModel, q_rad: Array) -> Array:
 
 
 def arm_moves(way_rad: ArrayLike) -> bool:
-    """Return whether base, shoulder or elbow moves along a path (n, 6)."""
+    """Return whether base, shoulder or elbow turns along a path of joint vectors (n, 6)."""
     path = np.asarray(way_rad)
     return len(path) > 0 and bool(np.ptp(path[:, :3], axis=0).max() >= STILL_RAD)

@@ -39,9 +39,9 @@ class PlanStep:
     q_rad: tuple[float, ...]
     R_base_flange: tuple[tuple[float, ...], ...]
     turn_rad: float
-    """Angle by which the leading joint turns in the move."""
+    """Angle of the joint that turns most in the move."""
     speed_rad_s: float
-    """Speed of the leading joint."""
+    """Speed in the move of the joint that turns most."""
     duration_s: float
     certified: bool
     clearance_m: float
@@ -51,14 +51,14 @@ class PlanStep:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Plan(Displayed):
-    """A closed tour of poses, or a sweep; `to_dict` defines the file."""
+    """Plan of a closed tour of poses, or of a sweep; `to_dict` defines the plan file."""
 
     kind: str
     """Kind of plan: constant, wrist, posture, box, cone, reachable, tool, sets, hung, verification or sweep."""
     why: tuple[str, ...]
-    """Sentences about the reason for this plan and its loss of accuracy."""
+    """Sentences that say why a plan of this kind was made, and what accuracy it loses."""
     made_for: Mapping[str, str]
-    """SHA-256 of the model, kinematics, tool and scene with margins. Files of version 1 lack the kinematics."""
+    """SHA-256 of the arm's model and kinematics, tool and scene with margins. Files of version 1 lack kinematics."""
     steps: tuple[PlanStep, ...]
     acceleration_rad_s2: float
     ball_m: float
@@ -69,9 +69,9 @@ class Plan(Displayed):
     description: Mapping[str, Any]
     """Model, kinematics, tool, scene and speeds; see `marked` for `measured` and `emulated`."""
     sweep: Sweep | None = None
-    """Curve of a sweep, whose points are the steps; None for a tour."""
+    """Curve of a sweep, whose points `steps` contains; None for a tour."""
     off_curve_m: float = 0.0
-    """Bound on the loss of clearance on the curve relative to the straight moves between the steps."""
+    """Upper bound on how much less clearance a sweep's curve has than the straight moves between its steps, m."""
 
     def _summary(self) -> Summary:
         return Summary(f"Plan {self.kind}, {counted(len(self.steps), 'pose')}", notes=_summary(self))
@@ -84,7 +84,7 @@ class Plan(Displayed):
     @property
     def arm_rests(self) -> bool:
         """Whether base, shoulder and elbow stay at rest during the whole tour."""
-        # If these joints move, the whole arm needs clear space, not only the ball around the wrist.
+        # If joints 1 to 3 move, the whole arm needs clear space, not only the ball around the wrist.
         return len({step.q_rad[:3] for step in self.steps}) == 1
 
     @property
@@ -147,7 +147,7 @@ class Plan(Displayed):
         return float(sum(step.duration_s for step in self.steps))
 
     def limited(self, certifier: Certifier, speeds: Speeds) -> "Plan":
-        """Return the plan with its speeds reduced to these limits."""
+        """Return the plan with those of its speeds reduced that exceed these limits."""
         q = np.array([step.q_rad for step in self.steps])
         allowed = speed_of_leading_joint(certifier.arm, q, np.roll(q, -1, axis=0), speeds)
         steps = (
@@ -158,7 +158,7 @@ class Plan(Displayed):
         return replace(self, steps=tuple(steps), acceleration_rad_s2=acceleration_rad_s2)
 
     def at_share(self, share: float) -> "Plan":
-        """Return the plan of a sweep along the same curve at this share of the speed."""
+        """Return the plan of a sweep slowed to this fraction of its speed, along the same curve."""
         if self.sweep is None or share == 1.0:
             return self
         return replace(self, sweep=self.sweep.slower(share), acceleration_rad_s2=self.acceleration_rad_s2 * share**2)
@@ -184,7 +184,7 @@ class Plan(Displayed):
         )
 
     def room_in_words(self) -> str:
-        """Describe the space that must be clear."""
+        """Describe the space around the arm that the operator must keep clear."""
         ball = self.ball_in_words()
         if self.arm_rests:
             crossing = "where the axes of wrist 1 and 2 cross"
@@ -192,13 +192,13 @@ class Plan(Displayed):
         return f"Wrist and tool stay {ball}, and the whole arm moves: keep the space of both clear and cables slack."
 
     def ball_in_words(self) -> str:
-        """Describe the radius and centre of the ball."""
+        """Describe radius and centre of the ball that contains wrist and tool."""
         x, y, z = (f"{value:.2f}" for value in self.ball_centre_m)
         return f"within {self.ball_m:.2f} m of x {x}, y {y}, z {z} m in base"
 
     @property
     def sha256(self) -> str:
-        """SHA-256 of the contents of the file."""
+        """SHA-256 of the contents of the plan file."""
         return str(self.to_dict()["sha256"])
 
     def to_dict(self) -> dict[str, Any]:
@@ -410,14 +410,14 @@ def ball_of(certifier: Certifier, start_rad: Array, end_rad: Array) -> tuple[Arr
     share = np.linspace(0, 1, BALL_SAMPLES)[:, None, None]
     wrist_m = certifier.arm.frames(((1 - share) * start_rad + share * end_rad).reshape(-1, 6)).wrist_m
     centre_m = (wrist_m.min(axis=0) + wrist_m.max(axis=0)) / 2
-    # Between two samples the wrist centre leaves the ball of the samples by at most half a step.
+    # Between two samples the wrist centre is outside the ball around the samples by at most half a step.
     step_m = np.linalg.norm(np.diff(wrist_m.reshape(BALL_SAMPLES, -1, 3), axis=0), axis=2).max()
     away_m = np.linalg.norm(wrist_m - centre_m, axis=1).max() + step_m / 2
     return centre_m, certifier.arm.ball_m + float(away_m)
 
 
 def fingerprints(certifier: Certifier) -> dict[str, str]:
-    """Return the SHA-256 of model, kinematics, tool and scene, on which the proof of clearance depends."""
+    """Return the SHA-256 of each part of a cell on which the proof of clearance depends, such as tool and scene."""
     hung = [] if certifier.arm.hung is None else [asdict(certifier.arm.hung)]
     return {
         "model": digest(certifier.arm.describe()),
@@ -433,7 +433,7 @@ def digest(value: Any) -> str:
 
 
 def _prediction_json(prediction: Prediction) -> dict[str, Any]:
-    """Return the sigma of each estimate; None if the poses do not determine it."""
+    """Return predicted sigmas and condition numbers as JSON values; None for what the poses do not determine."""
     values: dict[str, Any] = {name: np.asarray(sigma).tolist() for name, sigma in prediction.sigma.items()}
     for name in ("force_rms_N", "torque_rms_Nm", "cond9", "cond_u1", "second_basin_gap"):
         values[name] = getattr(prediction, name)
@@ -455,7 +455,7 @@ def way_in_words(way_rad: ArrayLike, clearance_m: float) -> str:
 
 
 def turns_in_words(way_rad: ArrayLike) -> str:
-    """Describe the joints that move along a path, each with its range."""
+    """Describe which joints turn along a path of joint vectors, and each joint's range in degrees."""
     ranges_deg = np.degrees(np.ptp(np.asarray(way_rad), axis=0))
     turns = [
         f"{name} {turn:.0f}°" for name, turn in zip(JOINTS, ranges_deg, strict=True) if turn >= np.degrees(STILL_RAD)
@@ -513,7 +513,7 @@ def _summary(plan: Plan) -> list[str]:
 
 def _accuracy(plan: Plan) -> str:
     sigma, guess = plan.predicted, plan.description["guess"]
-    # Plans of version 0.1.0 have no gain error.
+    # Plan files of ftdrive 0.1.0 contain no assumed gain error of the sensor.
     gain = f", a sensor gain error of {100 * guess['gain_sigma']:.2g} %" if "gain_sigma" in guess else ""
     tilt_deg = np.degrees(_largest_sigma([sigma["tilt_alpha_rad"], sigma["tilt_beta_rad"]]))
     return (
@@ -526,5 +526,5 @@ def _accuracy(plan: Plan) -> str:
 
 
 def _largest_sigma(sigma: object) -> float:
-    """Return the largest value; NaN if one is null, because the poses do not determine it."""
+    """Return the largest of some sigmas from a plan file; NaN if the poses do not determine one, stored as null."""
     return float(np.max(np.array(sigma, dtype=np.float64)))

@@ -31,7 +31,7 @@ from ftdrive.planning.search.tours import clear_tour
 from ftdrive.planning.sweep_planner import plan_sweep
 from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, model_named
 
-# Posture at which all models with usual tools have room for the constant tour; the wrist is at the tour's first pose.
+# Posture in which all arm models with usual tools have room for the constant tour; the wrist is at its first pose.
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
 # Number of poses for a new tool on a calibrated cell.
@@ -40,12 +40,12 @@ TOOL_POSES = 4
 HUNG_POSES = 12
 BOX_HALF_SIZE_M = 0.1
 FEWEST_CHOSEN = 6
-# Number of spare orientations of a random set, in case some are out of reach.
+# Number of extra orientations that a random set offers, in case some are out of reach.
 SPARE = 100
-# Upper limit of the speeds, even if a plan or an old configuration contains higher ones.
+# Upper limits of speed and acceleration, even if a plan or an old configuration contains higher values.
 FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
 
-# Assumed standard deviation of the mean of a pose, per axis, N and N·m.
+# Assumed standard deviation of the mean wrench measured at a pose, per axis, N and N·m.
 _NOISE = 0.05, 0.003
 # A tour: numbers of the orientations and joint vectors (n, 6), in the order of travel.
 Found = tuple[Sequence[int], Array]
@@ -54,14 +54,14 @@ Attempt = tuple[str, Sequence[str], Found | None]
 
 
 def guess_of(certifier: Certifier, cell: CellConfig | None = None) -> Guess:
-    """Return the prior `guess_of_devices` with the centre of mass at half the tool length and the lean of the base."""
+    """Return the prior `guess_of_devices`, with the lean of the base and a centre of mass at half the tool length."""
     length_m = max(part.to_m for part in certifier.arm.tool)
     guess = Guess(USUAL_KG, *_NOISE, sensor=SensorMatrix.usual()) if cell is None else guess_of_devices(cell)
     return replace(guess, p_sensor_com_m=(0.0, 0.0, length_m / 2), tilt_beta_rad=certifier.scene.lean_rad)
 
 
 def guess_of_devices(cell: CellConfig) -> Guess:
-    """Return a prior from the described mass of the tool and accuracy of sensor and arm, with typical noise."""
+    """Return a prior with the mass of the tool and the accuracy of sensor and arm as configured, and typical noise."""
     sensor = cell.sensor
     setup = Setup(
         sensor_accuracy_percent=sensor.accuracy_percent,
@@ -151,7 +151,7 @@ def _plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess:
         )
     why = [f"{TOOL_POSES} poses for a new tool; mounting and base are known.", *_chosen_words(tour)]
     plan = make_plan("tool", why, certifier, tour.numbers, tour.q_rad, speeds, guess)
-    return replace(plan, why=tuple(why))  # without the predicted error, which ignores the earlier calibration
+    return replace(plan, why=tuple(why))  # not the predicted error, which ignores the earlier calibration
 
 
 def _plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: Guess) -> Plan:
@@ -290,7 +290,7 @@ def _pose_numbers(poses: int) -> tuple[int, ...]:
 
 
 def _winds_little(q_rad: Array, q_now: Array) -> bool:
-    """Return whether joint 6 stays within its window about the current angle."""
+    """Return whether joint 6 stays within 200° of its current angle in all poses, so that the cable winds little."""
     return bool(np.abs(q_rad[:, 5] - q_now[5]).max() <= WRIST_6_RAD + 1e-9)
 
 
@@ -316,7 +316,7 @@ def _box(
 
 
 def _at_pan(q_rad: Array, numbers: Sequence[int]) -> Array:
-    """Return orientations (n, 3, 3) of the constant tour, which turn about base z with joint 1."""
+    """Return the constant tour's orientations (n, 3, 3), turned about base z to the angle of joint 1."""
     return np.asarray(Rotation.from_euler("z", q_rad[0] - np.pi / 4).as_matrix() @ special(numbers))
 
 
@@ -485,7 +485,7 @@ class _Shoulder:
         self._radius_m, self._margin_m = SHAPES[name].shoulder_radius_m, Margins().scene_m
 
     def against_plane(self, row: Sequence[float]) -> str:
-        """Describe the error of a plane and the plane that was probably meant; empty if there is no error."""
+        """Describe why a configured plane is impossible, and which one was probably meant; empty if it is possible."""
         gap_m, (x, y, z, place) = self._above_m(row), row
         if gap_m >= self._margin_m:
             return ""
@@ -501,7 +501,7 @@ class _Shoulder:
         )
 
     def against_box(self, row: Sequence[float]) -> str:
-        """Describe the error of a box; empty if there is no error."""
+        """Describe why a configured box is impossible; empty if it is possible."""
         box = box_from_mm(row)
         away_m = float(np.linalg.norm(self._centre_m - np.clip(self._centre_m, box.low_m, box.high_m)))
         gap_m = away_m - self._radius_m
@@ -532,7 +532,7 @@ def _cylinder_from_mm(values: Sequence[float]) -> Cylinder:
 
 
 def plane_from_mm(values: Sequence[float]) -> Plane:
-    """Return a plane from a normal of any length and the smallest allowed offset along it, mm."""
+    """Return a plane from values x, y, z of a normal of any length, and the smallest allowed offset along it, mm."""
     *normal, offset_m = _metres("a plane", "its normal and an offset", values, (4,))
     length = float(np.linalg.norm(normal))
     if not length:

@@ -29,18 +29,18 @@ from ftdrive.planning.search.nodes import constant_tour, with_room
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
-# Range of the duration, s. After 20 s, white noise limits the accuracy of any estimator.
+# Shortest and longest duration of a sweep, s. Beyond 20 s, white noise limits the accuracy of any estimator.
 SECONDS = (10.0, 120.0)
 RAMP_S = 3.0
-# Time between two steps of the plan, s.
+# Time between two steps that the plan of a sweep lists, s.
 STEP_S = 0.2
-# Lag of the controller, s: its `lookahead_time`.
+# Time, s, by which the controller lags behind the curve: the `lookahead_time` of its command `servoj`.
 SMOOTHED_S = 0.1
-# Number of random curves that are tried, and number of changes to the best of them.
+# Number of random curves that are tried, and number of variations of the best curve so far.
 RANDOM, CHANGED = 40, 200
-# Sizes of a change, as shares of a new random curve.
+# Step sizes of the search: the fractions of a new random curve that are mixed into the best curve so far.
 STEPS = (0.03, 0.1, 0.3)
-# Number of the best curves whose proof is tried at each posture, in each of the sizes.
+# At each of `POSTURES` postures, a proof is tried for this many of the best curves, each in all `SIZES` of amplitude.
 PROVEN = 6
 SIZES = (1.0, 0.9, 0.8, 0.6)
 POSTURES = 6
@@ -49,12 +49,12 @@ POSTURES = 6
 SLOW_HZ, QUICK_HZ = (0.06, 0.16), (0.3, 0.9)
 MOST_RAD = 1.5
 _MODEL_STEP_S = 0.01
-# Only every fifth point of the proof is checked first.
+# A quick collision check before the proof uses every fifth point of the proof only.
 _COARSE = 5
-# Penalty on the score of a curve that collides, so that it is tried last, with smaller amplitudes.
+# Penalty on the score of a curve that seems to collide: it is tried last, as smaller amplitudes may make it clear.
 _TOUCHING = 10.0
 _ROW_S = 0.12
-# Weight of log(sigma of the inertia) relative to log(compensation error) in the score.
+# Weight of log(sigma of the moments of inertia) relative to log(compensation error) in the score of a curve.
 _INERTIA_WORTH = 0.5
 
 
@@ -95,7 +95,7 @@ def plan_sweep(
 
 
 def _centres(certifier: Certifier, q_now: Array) -> Iterator[Array]:
-    """Yield centres of the sweep: the current posture, then others of the wrist, then others of the arm."""
+    """Yield postures for the centre of a sweep: the current one, then with another wrist, then with another arm."""
     yield q_now
     for turn in (np.pi / 2, -np.pi / 2):
         yield np.concatenate([q_now[:4], [turn], q_now[5:]])
@@ -108,7 +108,7 @@ def _centres(certifier: Certifier, q_now: Array) -> Iterator[Array]:
 def _scored_sweeps(
     certifier: Certifier, centre: Array, seconds: float, *, speeds: Speeds, stop_rad_s2: float, guess: Guess
 ) -> list[tuple[float, Sweep]]:
-    """Return random curves, and changes of the best one that seems clear, with their scores; the best first."""
+    """Return random curves, and variations of the best that seems clear, with their scores; smallest score first."""
     arm = certifier.arm
     rng, scored = np.random.default_rng(0), list[tuple[float, Sweep]]()
     best, least = _random_shape(rng), np.inf
@@ -130,19 +130,19 @@ def _scored_sweeps(
 
 
 def _seems_free(certifier: Certifier, sweep: Sweep, stop_rad_s2: float) -> bool:
-    """Return whether a few points of the curve keep the margins."""
+    """Return whether the arm keeps the margins at a few points of the curve, as a quick check before the proof."""
     keeping = certifier.keeping(certifier.reach_m(_off_curve(sweep, stop_rad_s2)))
     return bool(keeping.free(sweep.at(_times(sweep, _COARSE * PROOF_S))).all())
 
 
 def _random_shape(rng: np.random.Generator) -> Array:
-    """Return random numbers (3, 6) in 0 to 1 per wrist joint: two frequencies, quick share, amplitude, two phases."""
+    """Return random numbers (3, 6), 0 to 1, that define a curve: 2 frequencies, share, size, 2 phases per joint."""
     return rng.uniform(size=(len(WRISTS), 6))
 
 
 def _curve(drawn: Array, centre: Array, seconds: float) -> Sweep:
     hertz = np.stack([low + (high - low) * drawn[:, k] for k, (low, high) in enumerate((SLOW_HZ, QUICK_HZ))], axis=1)
-    quick = 0.1 + 0.8 * drawn[:, 2]  # share of the acceleration
+    quick = 0.1 + 0.8 * drawn[:, 2]  # the quick sine's share of the acceleration
     strength = np.stack([1 - quick, quick], axis=1) / (2 * np.pi * hertz) ** 2
     size = (0.2 + 0.8 * drawn[:, 3]) * MOST_RAD
     amplitude = size[:, None] * strength / strength.sum(axis=1, keepdims=True)
@@ -150,7 +150,7 @@ def _curve(drawn: Array, centre: Array, seconds: float) -> Sweep:
 
 
 def _within(arm: ArmModel, sweep: Sweep, speeds: Speeds) -> Sweep | None:
-    """Return the sweep with amplitudes reduced to all limits; None if that is not possible."""
+    """Return the sweep with amplitudes reduced so that it keeps all limits; None if that is not possible."""
     limits = MOST_RAD, speeds.joint_rad_s, speeds.joint_rad_s2
     most = np.stack([sweep.largest(k) for k in range(3)])[:, list(WRISTS)]
     most[0] = np.abs(sweep.at(_times(sweep, 0.05)) - sweep.centre_rad)[:, list(WRISTS)].max(axis=0)
@@ -208,7 +208,7 @@ def predicted(arm: ArmModel, sweep: Sweep, guess: Guess) -> tuple[float, float, 
 
 
 def _flange_motion(arm: ArmModel, sweep: Sweep) -> tuple[Motion, Motion]:
-    """Return the motion of the flange every 0.12 s, and its rate of change, by finite differences."""
+    """Return the motion of the flange in a sweep every 0.12 s, and its time derivative, by finite differences."""
     t, h = _times(sweep, _ROW_S), _MODEL_STEP_S
     places = [arm.frames(sweep.at(t + k * h)) for k in range(-2, 3)]
     columns = []

@@ -242,7 +242,7 @@ def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[flo
 
 
 def _values_and_sigmas(result: CalibrationResult) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-    """Return estimates and sigmas by name; `drift` (6,), N and N·m, is the reading after the return minus the first."""
+    """Return estimates and sigmas by name; `drift` (6,), N and N·m, if any, is the last bias minus the first."""
     sigma = dict(result.sigma)
     values = {name: getattr(result, name) for name in sigma}
     if result.drift is not None:

@@ -137,7 +137,7 @@ def rehearse_loads(
     operator: Callable[[], AbstractContextManager[Operator]],
     say: Callable[[str], object],
 ) -> LoadSolution:
-    """Take poses with a load at each of two hooks; return the sensor matrix solved from these and the tool poses."""
+    """Take poses with a load at each of two hooks; return the sensor matrix from these and the poses of `tool`."""
     truth = station.truth
     taken: list[tuple[Outcome, KnownLoad | None]] = [(tool, None)]
     for name, hook_mm in _HOOKS_MM.items():

@@ -257,7 +257,7 @@ def describe_run(task: Task, options: SessionOptions, connected: Mapping[str, De
         "devices": {role: asdict(info) for role, info in connected.items()},
         "mode": options.mode,
         **({} if options.method == "ml" else {"method": options.method}),
-        **({"station": {}} if task.cell.is_emulated else {}),  # in another process: true values unknown
+        **({"station": {}} if task.cell.is_emulated else {}),  # another process: true values unknown
         **options.description,
     }
 

@@ -182,7 +182,7 @@ class FreeToolPrediction(Guard):
 
     def predict(self, R_base_flange: Array) -> Array | None:
         """Return the wrench (6,) of a free tool at this orientation (3, 3); None while it is uncertain."""
-        # The full fit takes longer than a guard may wait.
+        # The recursive fit is used, because the full fit takes longer than a guard may wait.
         if self._moving_s < KNOWN_S:
             return None
         x = self._features(R_base_flange)

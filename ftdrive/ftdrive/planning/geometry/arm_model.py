@@ -25,7 +25,7 @@ from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, model_named
 
 PROJECTIONS = 24
 TINY_M = 1e-12
-# Tolerance of a lower bound relative to the true distance.
+# A lower bound on a distance is refined until it is within this of the true distance, m.
 CLOSE_M = 1e-5
 
 
@@ -50,11 +50,11 @@ class Bodies:
         return np.asarray(np.hypot(self.half_length_m, self.radius_m) + self.rounding_m)
 
     def centre_at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> Array:
-        """Return the centres (m, 3) of some of the bodies (n, k), one per pair of indices."""
+        """Return the centres (m, 3) of m of the bodies (n, k), one per pair of posture and body index."""
         return self.centre_m.reshape(-1, 3).take(row * len(self.half_length_m) + column, axis=0)
 
     def at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> "Bodies":
-        """Return some of the bodies (n, k) as a list (m,), one per pair of indices."""
+        """Return m of the bodies (n, k) as bodies (m,), one per pair of posture and body index."""
         return Bodies(
             self.centre_at(row, column),
             self.axis.reshape(-1, 3).take(row * len(self.half_length_m) + column, axis=0),
@@ -64,7 +64,7 @@ class Bodies:
         )
 
     def some(self, index: NDArray[np.intp]) -> "Bodies":
-        """Return some of a list (n,) of bodies."""
+        """Return those bodies of a list (n,) that have the given indices."""
         return Bodies(
             self.centre_m.take(index, axis=0),
             self.axis.take(index, axis=0),
@@ -84,7 +84,7 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def _extent(bodies: Bodies, direction: Array) -> Array:
-    """Return the extent (...) of each body along a unit direction, from its centre, m."""
+    """Return how far each body (...) extends from its centre along a unit direction, m."""
     along = dot(bodies.axis, direction)
     across = np.sqrt(np.maximum(1 - along**2, 0.0))
     return bodies.half_length_m * np.abs(along) + bodies.radius_m * across + bodies.rounding_m
@@ -102,7 +102,7 @@ def separation(a: Bodies, b: Bodies, enough_m: Array) -> Array:
     """
     between, capsule_distance = _between_axes(a, b)
     bound = capsule_distance - (a.radius_m + a.rounding_m + b.radius_m + b.rounding_m)
-    # The distance between the axes is exact for capsules, but not for flat ends.
+    # The distance computed from the axes is exact for capsules, but too small for cylinders with flat ends.
     open_ = np.flatnonzero((bound < enough_m) & (a.radius_m + b.radius_m > 0))
     if len(open_):
         inner_a, inner_b = (replace(body.some(open_), rounding_m=np.zeros(len(open_))) for body in (a, b))
@@ -115,7 +115,7 @@ def separation_from_box(bodies: Bodies, low_m: Array, high_m: Array, enough_m: A
     """Return a lower bound (k,) on the distance from each body to a box, m, which is refined up to `enough_m` (k,)."""
     centre, half = (low_m + high_m) / 2, (high_m - low_m) / 2
     point = bodies.centre_m
-    # For a body that intersects the box the bound is -1 m, because the depth is not computed.
+    # For a body that intersects the box the bound is -1 m, because the depth of penetration is not computed.
     best = np.full(len(point), -1.0)
     open_ = np.arange(len(point))
     for _ in range(PROJECTIONS):
@@ -459,7 +459,7 @@ class ArmModel:
 
     @cached_property
     def _lengths_m(self) -> tuple[float, ...]:
-        """Lengths of upper arm and forearm, then d4, d1, d5 and d6."""
+        """Lengths of upper arm and forearm, then the Denavit-Hartenberg offsets d4, d1, d5 and d6, m."""
         links = self.kinematics.links_m
         upper, fore = np.hypot(links[1:3, 0], links[1:3, 1]).tolist()
         d1_m, _, _, d4_m, d5_m, d6_m = links[:, 2].tolist()
@@ -467,7 +467,7 @@ class ArmModel:
 
     @cached_property
     def _off_m(self) -> Array:
-        """Bound (6,) on the displacement beyond each link relative to an arm with the same lengths and exact axes."""
+        """Bound (6,) on how far each link's axis errors displace what is beyond it from an arm with exact axes, m."""
         shift_m, tilt_rad = deviation(self.kinematics)
         length_m = np.linalg.norm(self.kinematics.links_m, axis=1)
         after_m = length_m[::-1].cumsum()[::-1] - length_m

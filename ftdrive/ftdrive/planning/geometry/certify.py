@@ -16,13 +16,13 @@ from ftdrivers.ur.kinematics import Array
 
 FIRST_STEP_RAD = np.radians(15)
 LAST_STEP_RAD = np.radians(0.4)
-# The reported clearance is below the true minimum of the move by at most this fraction or 2 mm.
+# A refined clearance is below the true smallest distance in the move by at most this fraction of it, or by 2 mm.
 TIGHTNESS = 0.1
 
 
-# Additional distance if the kinematics of the arm are not known: these angles times the levers of the joints between
-# two bodies. It covers the deviations of 15 real arms from their nominal models towards a plane (at most 8.3 mm).
-# Bodies of the wrist approach each other by up to 6.5 mm, which the margin between parts of the arm covers.
+# Angles that, times the levers of the joints between two bodies, give their extra distance if only nominal kinematics
+# are known. They cover the deviations of 15 real arms from their nominal models towards a plane (at most 8.3 mm).
+# Bodies of the wrist come closer by up to 6.5 mm than in the model, which the margin between parts of the arm covers.
 NOMINAL_RAD = np.array([0.0025, 0.0025, 0.0025, 0.0, 0.0, 0.0])
 
 
@@ -31,7 +31,7 @@ class Margins:
     """Smallest allowed distances, m."""
 
     self_m: float = 0.020
-    """Between parts of the arm and the tool; larger than the errors of their shapes and of nominal kinematics."""
+    """Between parts of the arm and the tool; larger than the errors of modelled shapes and of nominal kinematics."""
     scene_m: float = 0.030
     """Between the arm or its tool and the surroundings."""
 
@@ -75,7 +75,7 @@ class Certifier:
             # Seen from a body that a joint turns, the load turns about its hook by the same angle.
             own_m = own_m + hung.reach_m * ((self._pairs[:, 1:] >= len(arm.names) - 2) & ~between)
             string = np.flatnonzero(self._pairs[:, 1] == len(arm.names) - 2)
-            # The string starts at the tool, and swings towards other bodies.
+            # The string needs no margin from the tool, where it starts, but a larger one from other bodies: it swings.
             to_tool = low[string] == 6
             self._margin_m[string] += np.where(to_tool, -Margins().self_m, hung.swing_m)
         # (p, 6) largest approach per radian of each joint, m; the pairs with the scene follow those of the arm.
@@ -106,7 +106,7 @@ class Certifier:
         return Certifier(self.arm, self.scene, Margins(self.margins.self_m + more_m, self.margins.scene_m + more_m))
 
     def free(self, q_rad: ArrayLike) -> NDArray[np.bool_]:
-        """Return (n,) whether the margins are kept at joint vectors (n, 6)."""
+        """Return for each of the joint vectors (n, 6) whether the arm keeps the margins there, (n,) of bool."""
         q = np.asarray(q_rad, dtype=np.float64).reshape(-1, 6)
         row, pair = (index.ravel() for index in np.indices((len(q), len(self._margin_m))))
         needed = self._margin_m[pair]
@@ -136,10 +136,10 @@ class Certifier:
         start = np.asarray(start_rad, dtype=np.float64).reshape(-1, 6)
         turn = np.asarray(end_rad, dtype=np.float64).reshape(-1, 6) - start
         m, n_pairs, n_self = len(start), len(self._margin_m), len(self._pairs)
-        approach_m = np.abs(turn) @ self._lever_m.T  # (m, p) largest approach over the whole move
+        approach_m = np.abs(turn) @ self._lever_m.T  # (m, p) most that a pair can come closer over the whole move
         leading = np.abs(turn).max(axis=1)
-        proven = np.full((m, 2), np.inf)  # smallest lower bound over the settled intervals, by kind
-        nearest = np.full((m, 2), np.inf)  # smallest distance so far, by kind
+        proven = np.full((m, 2), np.inf)  # smallest lower bound of the settled intervals: self, scene
+        nearest = np.full((m, 2), np.inf)  # smallest distance found so far: self, scene
         least_excess, limited_by = np.full(m, np.inf), np.zeros(m, dtype=np.intp)
         clear = np.ones(m, dtype=np.bool_)
 

@@ -16,10 +16,10 @@ from ftdrivers.ur.kinematics import Array, Kinematics
 
 # Below this sine of q5 the axes of joints 4 and 6 are considered parallel.
 ALIGNED = 1e-9
-# Number of Newton steps from the solution for parallel axes; the remaining error is rounding.
+# Number of Newton steps from the solution for parallel axes, after which only rounding errors remain.
 _STEPS = 5
 _TINY = 1e-14
-# Largest error of a solution, m and rad.
+# Largest error, m and rad, of the flange pose for which joint angles count as a solution.
 _REACHED = 1e-6
 
 
@@ -47,7 +47,7 @@ class Frames:
 
 
 def checked_joints(q_rad: ArrayLike) -> Array:
-    """Return the joint vector (6,); raises `ConfigError` unless all joints are within one turn of zero."""
+    """Return joint angles as an array (6,); raises `ConfigError` unless all are within one turn of zero."""
     q = np.asarray(q_rad, dtype=np.float64)
     if q.shape != (6,) or not np.all(np.abs(q) <= 2 * np.pi + ALIGNED):
         raise ConfigError(f"joint angles are {np.degrees(q).round(1).tolist()} degrees: give six within ±360")
@@ -55,7 +55,7 @@ def checked_joints(q_rad: ArrayLike) -> Array:
 
 
 def frames(kinematics: Kinematics, q_rad: ArrayLike) -> Frames:
-    """Return the forward kinematics of joint vectors (n, 6)."""
+    """Return positions and axes of the joints and the flange at joint vectors (n, 6): the forward kinematics."""
     axes, points, R = _axes_and_flange(kinematics, np.asarray(q_rad, dtype=np.float64).reshape(-1, 6))
     along = kinematics.links_m[:, 2]
     return Frames(
@@ -181,7 +181,7 @@ def _parallel(kinematics: Kinematics) -> tuple[tuple[float, ...], Array]:
 
 
 def is_exact(kinematics: Kinematics) -> bool:
-    """Return whether the axes are exactly parallel or at right angles, as in a nominal arm."""
+    """Return whether the joint axes are exactly parallel or at right angles, as in a nominal arm."""
     return all(bool(off.max() < ALIGNED) for off in deviation(kinematics))
 
 
@@ -201,7 +201,7 @@ def deviation(kinematics: Kinematics) -> tuple[Array, Array]:
 
 
 def _refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array, p_base_flange_m: Array | None = None) -> Array:
-    """Return joint vectors with these poses by Newton's method from `q_rad` (n, 6); without positions, wrist only."""
+    """Improve joint vectors (n, 6) by Newton's method until they give these poses; without positions, wrist only."""
     first = 3 if p_base_flange_m is None else 0
     q = q_rad.copy()
     for _ in range(_STEPS):
@@ -221,7 +221,7 @@ def _refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array, p_base_
 
 
 def _wrist_angles(q1_rad: Array | float, R_base_flange: Array) -> tuple[Array, Array, Array]:
-    """Return psi, q5 and q6 (n, 2), first with positive q5, then with negative q5."""
+    """Return psi = q2 + q3 + q4, q5 and q6, each (n, 2), for orientations: first with q5 >= 0, then with q5 <= 0."""
     c1, s1 = np.cos(q1_rad), np.sin(q1_rad)
     R = np.asarray(R_base_flange, dtype=np.float64)
     x = np.moveaxis(c1 * R[:, 0].T + s1 * R[:, 1].T, 0, 1)  # rows of the orientation in the shoulder frame
@@ -237,5 +237,5 @@ def _wrist_angles(q1_rad: Array | float, R_base_flange: Array) -> tuple[Array, A
 
 
 def _wrapped(angle_rad: Array) -> Array:
-    """Return the angles in (-pi, pi]."""
+    """Return angles shifted by full turns into (-pi, pi]."""
     return np.asarray(np.pi - np.mod(np.pi - angle_rad, 2 * np.pi))

@@ -60,12 +60,12 @@ class Scene:
 
 
 def down_of(mounting: str | None) -> Array:
-    """Return the unit vector (3,) along gravity in base axes for a mounting."""
+    """Return the unit vector (3,) along gravity, base axes, for a mounting such as "wall"."""
     return Scene(lean_rad=lean_of(mounting)).down_base
 
 
 def lean_of(mounting: str | None) -> float:
-    """Return the lean of a mounting, rad: floor, wall, ceiling, or an angle in degrees; a floor if it is None."""
+    """Return the lean of the base, rad, for a mounting: "floor", "wall", "ceiling" or degrees; None means a floor."""
     mounting = mounting or "floor"
     if mounting in MOUNTINGS:
         return MOUNTINGS[mounting]

@@ -20,27 +20,27 @@ from ftdrive.planning.search.nodes import Nodes, grid, hung_nodes, wrist_nodes
 from ftdrive.planning.search.tours import clear_tour, connected
 from ftdrivers.ur.kinematics import Array
 
-# Number of tool directions, and number of turns about the tool axis for each direction.
+# Candidate orientations: number of tool directions, and number of turns about the tool axis for each direction.
 DIRECTIONS, SPINS = 150, 8
-# Fewer of both for a tool that is not round about the axis of joint 6: each turn needs its own collision check.
+# The same for a tool that is not round about the axis of joint 6: fewer, as each turn needs its own collision check.
 DIRECTIONS_OF_A_LUMP, SPINS_OF_A_LUMP = 60, 4
-# Largest number of disconnected parts of free space that are tried.
+# Free joint space may fall into disconnected parts; a tour is searched in at most this many of them.
 MOST_PARTS = 2
-# Number of the nearest joint vectors of each part to which a straight move is tried.
+# A straight move is tried to this many of the nearest joint vectors in each connected part of free joint space.
 FROM_HERE = 6
-# No other posture is tried if the predicted error is within this factor of the error of the best poses of the cone.
+# No other posture is tried if the predicted error is within this factor of that of the best poses, reachable or not.
 NEARLY = 1.05
 OTHER_POSTURES = 2
 POSTURE_STEP_DEG = 20
 # Number of the first chosen pose; 1 to 24 are those of the paper.
 FIRST_NUMBER = 101
-# Number of tool directions with which postures are compared.
+# Postures of joints 1 to 3 are compared by how many of this number of tool directions they reach.
 LOOKS = 24
-# Tilts of the tool with a load on a string, and the number of azimuths of each.
+# Tilts of the tool with a load on a string, degrees from straight down, and number of azimuths at each tilt.
 HUNG_TILTS_DEG, HUNG_AZIMUTHS = (75, 60, 45), 24
-# Number of azimuths with which positions of the hook are compared, and number of positions that are tried.
+# Number of azimuths at each tilt by which hook positions are compared, and number of hook positions that are tried.
 LOOKS_OF_A_TILT, MOST_HOOKS = 8, 4
-# Largest distance of the hook from its position between two tilts; the first value with a tour is used.
+# Largest displacement of a load's hook, m, in a move between two tilts; the first value that yields a tour is used.
 HOOK_M = (0.03, 0.06)
 
 
@@ -49,7 +49,7 @@ class Chosen:
     """A tour of chosen poses, in the order of travel."""
 
     numbers: tuple[int, ...]
-    """Numbers from 101, in the order of choice; the paper has numbers up to 24."""
+    """Numbers of the poses, from 101 in the order of choice; 1 to 24 are the special orientations."""
     q_rad: Array
     """(n, 6) joint vectors."""
     force_rms_N: float
@@ -181,14 +181,14 @@ def hung_tour(
 
 
 class _SteadyHook(Certifier):
-    """Certifier that proves only moves in which the hook of the load stays within `most_m` of its start."""
+    """Certifier that accepts only moves in which the hook of a hanging load stays within `most_m` of its start."""
 
     def __init__(self, certifier: Certifier, most_m: float) -> None:
         super().__init__(certifier.arm, certifier.scene, certifier.margins)
         self._most_m = most_m
 
     def certify(self, start_rad: ArrayLike, end_rad: ArrayLike, *, tight: bool = True) -> Certificate:
-        """Like `Certifier.certify`, but a move that displaces the hook is not clear."""
+        """Certify like `Certifier.certify`, but a move that displaces the hook too far counts as not clear."""
         start, end = (np.asarray(q, dtype=np.float64).reshape(-1, 6) for q in (start_rad, end_rad))
         hooks_m = [self.arm.hook_m(self.arm.frames(start + share * (end - start))) for share in np.linspace(0, 1, 9)]
         stays = np.linalg.norm(np.subtract(hooks_m, hooks_m[0]), axis=2).max(axis=0) <= self._most_m
@@ -197,7 +197,7 @@ class _SteadyHook(Certifier):
 
 
 def _hooks(certifier: Certifier, q_now: Array) -> list[tuple[Array, float]]:
-    """Return positions (3,) of the hook with the most reachable tilts, m, each with a turn about the tool axis, rad."""
+    """Return pairs: a hook position (3,), m, where many tilts are reachable, and a turn about the tool axis, rad."""
     down, at = certifier.scene.down_base, certifier.arm.frames(q_now)
     present_rad = _heading(at.R_base_flange[0], down)
     looks = tilted_candidates(np.radians(HUNG_TILTS_DEG), LOOKS_OF_A_TILT, present_rad, down)
@@ -208,7 +208,7 @@ def _hooks(certifier: Certifier, q_now: Array) -> list[tuple[Array, float]]:
 
 
 def _heading(R_base_flange: Array, down_base: Array) -> float:
-    """Return the turn about the tool axis in `tilted_candidates` that is nearest to an orientation (3, 3), rad."""
+    """Return the turn about the tool axis, rad, with which `tilted_candidates` comes nearest to this orientation."""
     straight = tilted_candidates([0.0], 1, 0.0, down_base)[0]
     turn = straight.T @ R_base_flange
     # `tilted_candidates` turns the tool about its -z axis.
@@ -216,7 +216,7 @@ def _heading(R_base_flange: Array, down_base: Array) -> float:
 
 
 def _away(certifier: Certifier, wrist_m: Array) -> Array:
-    """Return shifts (k, 3) of the hook, nearest first: up and down, towards the base and away from it, m."""
+    """Return shifts (k, 3) of the hook to try, m, smallest first: up and down, towards the base and away from it."""
     down = certifier.scene.down_base
     outwards = wrist_m - wrist_m @ down * down
     outwards /= max(float(np.linalg.norm(outwards)), 1e-9)
@@ -245,7 +245,7 @@ def _first_tour(
     choice: Callable[[Nodes], Nodes],
     speeds: Speeds,
 ) -> tuple[tuple[int, ...], Array] | None:
-    """Return the first tour of `_tours_at` at the current posture of joints 1 to 3, or at one with more room."""
+    """Return the first tour that `_tours_at` finds with joints 1 to 3 as now, or else at a posture with more room."""
 
     def tours(q: Array) -> Iterator[tuple[tuple[int, ...], Array]]:
         return _tours_at(certifier, q, candidates, spins, poses, choice, speeds)
@@ -276,7 +276,7 @@ def _tours_at(
     part = connected(certifier, q, group % spins)
     reached = [np.unique(group[part == p]) for p in range(part.max() + 1)]
     here = _begins_here(certifier, q_now, q, part)
-    # Orientations with wrist 2 rotated by 360° form a separate part, which no collision-free approach reaches.
+    # Joint vectors with wrist 2 turned by 360° form a separate part, which no collision-free approach reaches.
     for p in sorted(range(len(reached)), key=lambda p: (not here[p], -len(reached[p])))[:MOST_PARTS]:
         if len(reached[p]) < poses:
             break
@@ -305,7 +305,7 @@ def _tour_through(
 
 
 def _begins_here(certifier: Certifier, q_now: Array, q_rad: Array, part: Nodes) -> list[bool]:
-    """Return for each part of free space whether a clear straight move leads into it from the current joint angles."""
+    """Return for each connected part of free joint space whether a clear straight move from `q_now` leads into it."""
     near = np.argsort(np.abs(q_rad - q_now).max(axis=1), kind="stable")
     ends = [near[part[near] == p][:FROM_HERE] for p in range(part.max() + 1)]
     goals = q_rad[np.concatenate(ends)]
@@ -314,7 +314,7 @@ def _begins_here(certifier: Certifier, q_now: Array, q_rad: Array, part: Nodes) 
 
 
 def _others(certifier: Certifier, q_now: Array, candidates: Array) -> Array:
-    """Return the postures (k, 3) of joints 1 to 3 with the most reachable tool directions."""
+    """Return the postures (k, 3) of joints 1 to 3, not the current one, that reach the most tool directions."""
     postures = grid(certifier, q_now, POSTURE_STEP_DEG)
     looks = candidates[np.linspace(0, len(candidates) - 1, LOOKS).astype(int)]
     q = np.array([wrist_inverse(certifier.arm.kinematics, posture, looks) for posture in postures])  # (m, LOOKS, 2, 6)

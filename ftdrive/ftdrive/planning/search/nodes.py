@@ -25,13 +25,13 @@ Nodes = NDArray[np.intp]
 SHOULDER_RAD = float(np.radians(110))
 # Wrist 3 winds the cable, so it stays within 200° of its current angle.
 WRIST_6_RAD = float(np.radians(200))
-# Half a turn plus 3 degrees, by which a real arm may differ from the table, so that both directions remain possible.
+# Half a turn in both directions, plus 3 degrees by which a real arm's wrist angles may differ from the nominal ones.
 HALF_TURN_RAD = float(np.radians(183))
 # Largest turn of each joint to either side of its current angle.
 WINDOW_RAD = np.array([np.pi, SHOULDER_RAD, np.inf, HALF_TURN_RAD, HALF_TURN_RAD, WRIST_6_RAD])
-# Largest elbow angle from the stretched arm: the elbow cannot fold further, which the collision shapes do not show.
+# Largest elbow angle, 0 being the stretched arm. The elbow cannot fold further; the collision shapes do not show that.
 ELBOW_RAD = float(np.radians(165))
-# Flange positions along each edge of a box, as shares of half its size.
+# Flange positions to try along each edge of a box, from its centre, in units of half the edge.
 STEPS = (-1.0, 0.0, 1.0)
 
 
@@ -104,8 +104,8 @@ def distinct(certifier: Certifier, q_rad: Array) -> tuple[Array, Nodes]:
 
 
 def _within_windows(q_rad: Array, group: Nodes, q_now: Array, first: int) -> tuple[Array, Nodes]:
-    """Return the joint vectors with full turns added to the joints from index `first`, within windows and limits."""
-    # A joint far from zero has no room on one side, so its window is about zero.
+    """Return all variants of joint vectors with full turns of joints from index `first`, within windows and limits."""
+    # A joint more than half a turn from zero has no room on one side, so its window is centred on zero.
     middle = np.where(np.abs(q_now) > np.pi, 0.0, q_now)
     for joint in range(first, 6):
         turned = q_rad[:, None] + 2 * np.pi * np.array([-1, 0, 1])[:, None] * np.eye(6)[joint]
@@ -130,14 +130,14 @@ _GRID_DEG = 10
 _SHOULDER_DEG, _ELBOW_DEG = (-180, 0), (-160, 160)
 _BATCH = 40
 _LEVEL = 1e-9
-# Largest number of postures that are tried, which limits the search time in a cell without a tour.
+# Most postures that are tried, which limits the search time in a cell where no posture has a tour.
 MOST_POSTURES = 200
 
 
 def grid(certifier: Certifier, q_rad: Array, step_deg: int = _GRID_DEG) -> Array:
-    """Return candidate postures (m, 3) of joints 1 to 3, the nearest first."""
+    """Return a grid of postures (m, 3) of joints 1 to 3 at which a tour may have room, nearest first."""
     level = not certifier.scene.boxes and all(np.hypot(*plane.normal[:2]) < _LEVEL for plane in certifier.scene.planes)
-    # In a scene without vertical features all pan angles are equivalent.
+    # In a scene of horizontal planes only, all angles of joint 1 are equivalent.
     pans = q_rad[0] + np.radians(_PANS_DEG[:1] if level else _PANS_DEG)
     shoulder, elbow = (np.radians(np.arange(low, high + 1, step_deg)) for low, high in (_SHOULDER_DEG, _ELBOW_DEG))
     postures = np.array(list(product(pans, shoulder, elbow)))
@@ -147,12 +147,12 @@ def grid(certifier: Certifier, q_rad: Array, step_deg: int = _GRID_DEG) -> Array
 
 
 def with_room(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
-    """Yield constant tours (24, 6) at other postures, whose poses are free; their moves may not be clear."""
+    """Yield constant tours (24, 6) at other postures, with poses free of collisions; their moves are not yet proven."""
     postures = grid(certifier, q_rad)
     offered = 0
     for batch in np.array_split(postures, max(1, len(postures) // _BATCH)):
         tours = np.array([constant_tour([*first, *q_rad[3:]]) for first in batch])
-        # Poses that differ in joint 6 alone have nearly the same shape; the proof checks them later.
+        # Of poses that differ in joint 6 alone one is tested here, as shapes are alike; the proof tests all later.
         q = tours[:, DIFFERENT_SHAPES]
         for i in np.flatnonzero(certifier.free(q.reshape(-1, 6)).reshape(q.shape[:2]).all(axis=1)):
             yield constant_tour(tours[i, 0], certifier.arm.kinematics)
@@ -195,9 +195,9 @@ NUMBERS = tuple(row[0] for row in _TOUR_DEG)
 DIFFERENT_SHAPES = tuple(np.unique([row[1:3] for row in _TOUR_DEG], axis=0, return_index=True)[1].tolist())
 
 
-# The wrist angles of an orientation are the same for every nominal arm.
+# Any model serves, because the wrist angles of an orientation are the same for every nominal arm.
 _NOMINAL = MODELS["UR5e"]
-# Bound on the difference between table and wrist angles of a real arm, which is within 1.3 degrees of the nominal one.
+# Most by which wrist angles of a real arm, within 1.3 degrees of its nominal model, differ from the table of the tour.
 _ROOM_RAD = float(np.radians(3))
 
 

@@ -18,21 +18,21 @@ from ftdrive.planning.search.nodes import Nodes, distinct
 from ftdrivers.ur.kinematics import Array
 
 FORBIDDEN_S = 1e6
-# Cost per radian, summed over the joints: it prefers less motion among equally fast tours.
+# Cost, s, per radian of the joints' total travel: among equally fast tours, one with less motion is preferred.
 COST_OF_TRAVEL_S = 0.02
-# Number of perturbations of the final search, and of each earlier round.
+# Number of perturbations of the order in the final search, and in each earlier round.
 SHAKES = 150
 SHAKES_A_ROUND = 10
-# Largest number of rounds; each proves the moves of a tour and excludes those that are not clear.
+# Largest number of rounds; each certifies the moves of the best tour, and excludes those that are not clear.
 ROUNDS = 60
-# Up to this number of joint vectors all moves are considered; otherwise only moves to the nearest in each group.
+# Up to `FEW` joint vectors all moves are considered; otherwise only those to the `NEAREST_OF_EACH` of each group.
 FEW = 120
 NEAREST_OF_EACH = 2
-# With at least this number of groups, only moves to the nearest joint vectors of all groups are considered.
+# From `MANY_GROUPS` groups on, only moves to the `NEAREST_OF_ALL` joint vectors, of whatever group, are considered.
 MANY_GROUPS, NEAREST_OF_ALL = 60, 40
-# Approximate number of neighbours in all layers together.
+# Number of neighbours, about, to which each joint vector is linked when connected parts are searched.
 NEIGHBOURS = 10
-# Number of nodes of each group that are used; the larger number if the first nodes are not connected.
+# So many joint vectors of each group are used; the larger number if no tour connects the smaller number.
 MOST_NODES = (25, 60)
 
 
@@ -148,7 +148,7 @@ class _Proof:
         self._clear = np.eye(n, dtype=np.bool_)
 
     def prove(self, start: Nodes, end: Nodes) -> NDArray[np.bool_]:
-        """Return (m,) whether moves between nodes are clear."""
+        """Return for each of m moves between nodes whether it is proven clear; certify those not yet certified."""
         i, j = self.of[start], self.of[end]
         open_ = np.unique(np.sort(np.stack([i, j], axis=1)[~self._known[i, j]], axis=1), axis=0)
         if len(open_):
@@ -159,12 +159,12 @@ class _Proof:
         return np.asarray(self._clear[i, j])
 
     def not_refuted(self, nodes: Nodes) -> NDArray[np.bool_]:
-        """Return (m, m) whether moves between nodes are clear or not yet certified."""
+        """Return (m, m) whether the move from node to node is proven clear or not yet certified."""
         of = self.of[nodes]
         return np.asarray((self._clear | ~self._known)[np.ix_(of, of)])
 
     def parts(self, nodes: Nodes, start: Nodes, end: Nodes) -> Nodes:
-        """Return the connected part (m,) of each node, as linked by those of the given moves that are clear."""
+        """Return for each node the number (m,) of its connected part, linked by those given moves that are clear."""
         clear = self.prove(nodes[start], nodes[end])
         edges = coo_array((np.ones(clear.sum()), (start[clear], end[clear])), shape=(len(nodes), len(nodes)))
         return np.asarray(connected_components(edges, directed=False)[1], dtype=np.intp)
@@ -197,7 +197,7 @@ def _nearest_neighbours(groups: list[Nodes], cost: Array) -> Nodes:
 
 
 def _improved(tour: Nodes, group: Nodes, groups: list[Nodes], cost: Array) -> tuple[Nodes, float]:
-    """Return a tour that no reversal and no other choice within the groups shortens, and its cost, s."""
+    """Shorten a tour until no reversal of a segment and no other node of a group helps; return it and its cost, s."""
     tour, length = _choice(tour, group, groups, cost), np.inf
     while (now := _tour_length(tour, cost)) < length - 1e-9:
         length = now
@@ -220,11 +220,11 @@ def _reversed_parts(tour: Nodes, cost: Array) -> Nodes:
 
 
 def _choice(tour: Nodes, group: Nodes, groups: list[Nodes], cost: Array) -> Nodes:
-    """Return the tour with the best node of each group for the given order of the groups."""
+    """Return the cheapest tour through one node of each group, in the order of groups of the given tour."""
     order = [groups[g] for g in group[tour]]
     first = min(range(len(order)), key=lambda k: len(order[k]))
     order = order[first:] + order[:first]
-    total = cost[order[0][:, None], order[1]]  # (first, now)
+    total = cost[order[0][:, None], order[1]]  # (node of the first group, node now)
     before = []
     for one, other in zip(order[1:], [*order[2:], order[0]], strict=True):
         sums = total[:, :, None] + cost[one[:, None], other]
@@ -240,6 +240,6 @@ def _choice(tour: Nodes, group: Nodes, groups: list[Nodes], cost: Array) -> Node
 
 
 def _shaken(tour: Nodes, rng: np.random.Generator) -> Nodes:
-    """Return the tour with two neighbouring segments swapped (double bridge)."""
+    """Return the tour with two random neighbouring segments swapped (double bridge), to leave a local minimum."""
     a, b, c = np.sort(rng.choice(np.arange(1, len(tour) + 1), 3, replace=False))
     return np.concatenate([tour[:a], tour[b:c], tour[a:b], tour[c:]])
