@@ -24,18 +24,18 @@ from ftdrive.stream.noise import (
 )
 from ftdrive.stream.samples import Ns, Paired
 
-# Rotation of the tool after which the covariance of the prediction is evaluated again.
+# Rotation of the tool, rad, after which the covariance of the predicted wrench is evaluated again.
 _TURN_RAD = 0.02
-# Sigmas of the acceleration of a moving arm: linear if unknown, linear if predicted from past poses, and angular.
+# Sigmas assumed for the acceleration of a moving arm: linear if unknown; linear if it comes from past poses; angular.
 _UNKNOWN_M_S2, _COARSE_M_S2, _UNKNOWN_RAD_S2 = 1.0, 0.3, 2.5
 # Timing error of a predicted wrench, in addition to the delay error, because accelerations are means over some time.
 _INEXACT_S = 0.005
-# Friction torque of wrist 3, which the force/torque sensor inside the arm measures too.
+# Friction torque of wrist 3, one sigma; the force/torque sensor inside the arm measures it with the contact torque.
 _FRICTION_NM = 0.15
-# A contact begins after this many consecutive readings beyond the limit, and ends after as many within it. A single
-# longer mean would detect the contact later.
+# A contact begins after this many consecutive readings beyond the limit, and ends after as many within it. One mean
+# over their whole time would detect the contact later.
 _IN_A_ROW = 3
-# Time between two counted readings; shorter if inertia is subtracted, because the stream then waits for later poses.
+# Time between two readings that count; shorter if inertia is subtracted, as the stream is late then already.
 _LAG_S, _SHORT_LAG_S = READING_S, READING_S / 2
 
 
@@ -73,16 +73,16 @@ class ContactTest:
         if friction_axis is not None:
             self._friction[3:, 3:] = _FRICTION_NM**2 * np.outer(friction_axis, friction_axis)
         self._calibration: Calibrated | None = None
-        # Covariance of the inertial wrench that is not predicted.
+        # Covariance of the part of the inertial wrench that is not predicted, by accuracy of the prediction.
         self._unknown = dict.fromkeys(Inertia, np.zeros((6, 6)))
         self.uncertainty = np.zeros((6, 6))
-        """Covariance of the prediction at the newest orientation, sensor axes."""
+        """(6, 6) covariance of the wrench predicted for a free tool at the newest orientation, sensor axes."""
         self.limit = float(chdtri(6, false_alarm_rate))
-        """Limit of the squared distance of the newest reading."""
+        """Limit for the squared Mahalanobis distance of the newest reading from the prediction for a free tool."""
         self.restart()
 
     def restart(self) -> None:
-        """Discard earlier samples."""
+        """Discard earlier samples, because the next one does not continue them."""
         self._earlier = np.zeros((self._size - 1, 6))
         # Predicted wrenches of the last `READING_S` seconds.
         self._predicted: Array | None = None
@@ -90,7 +90,7 @@ class ContactTest:
         self._whitening: tuple[tuple[SensorNoise, int, Inertia | None], Array, Array] | None = None
 
     def expect(self, calibration: Calibrated, mass_kg: float, *, tensor_known: bool) -> None:
-        """Set the calibration of a free tool, its mass, and whether its inertia tensor is known."""
+        """Set the free tool from now on: its calibration, its mass, and whether its inertia tensor is known."""
         if self._calibration is None or calibration.parameters is not self._calibration.parameters:
             self._R = None
             B = wrench_by_acceleration(mass_kg, calibration.parameters.p_sensor_com_m)
@@ -114,7 +114,7 @@ class ContactTest:
         delay_sigma_s: float,
         inertia: Inertia,
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return readings (n, 6), squared distances (n,), NaN until noise is known, and which exceed the limit (n,).
+        """Return readings (n, 6), squared distances (n,), NaN while noise is unknown, and which are too far (n,).
 
         `residual` is the measured minus the predicted wrench (n, 6), `motion` the result of `MotionTracker.follow`, and
         `inertia` the accuracy of the predicted inertial wrench. Pass the samples to the free-tool filter as well.
@@ -170,7 +170,7 @@ class ContactTest:
         self._whitening = None
 
     def _whiten(self, noise: SensorNoise, state: int, inertia: Inertia, free: Following) -> tuple[Array, Array]:
-        """Return the whitening matrix (6, 6) and the mean (6,) of the readings of a free tool."""
+        """Return the matrix (6, 6) that whitens the readings of a free tool, and their expected mean (6,)."""
         key = noise, free.filter.changes, None if state == REST else inertia
         if self._whitening is None or self._whitening[0] != key:
             offset, covariance = free.filter.offset(self.uncertainty, np.eye(3) if self._R is None else self._R)
@@ -183,7 +183,7 @@ class ContactTest:
 
 
 def _hotelling_limit(rate: float, dof: float) -> float:
-    """Return the limit of the squared distance of six channels whose covariance has `dof` degrees of freedom."""
+    """Return the limit, exceeded at this rate, of Hotelling's T² of six channels with `dof` degrees of freedom."""
     if dof <= 6:
         return float("inf")
     return float(6 * dof / (dof - 5) * fdtri(6, dof - 5, 1 - rate))

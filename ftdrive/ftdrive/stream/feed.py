@@ -26,12 +26,12 @@ MEAN_S = 0.1
 """The screen and the page show means over this time, s."""
 SPANS_S = (2, 10, 60, 600)
 """Time spans that a plot can show, s."""
-# Bins per span. Twice as many are stored, because whole columns of a plot can be longer than the span.
+# Time bins per span of a plot. Twice as many are stored, as the whole columns of a plot can be longer than the span.
 _BINS = 1024
 _STATUS_NS = 50_000_000
-# Cut-off of the low-pass filter that a key of the screen switches on, Hz.
+# Cut-off frequency, Hz, of the low-pass filter that a key switches on in the live view.
 _LOWPASS_HZ = 40.0
-# Blocks and notes that wait for a slow screen or page; the oldest are dropped. Recordings do not use these queues.
+# Most blocks and notes that wait for a slow screen or page; older ones are dropped. Recordings use no such queue.
 _MOST_BLOCKS, _MOST_NOTES = 2000, 200
 _REST_NS = 2_000_000_000
 _STILL_RAD = 5e-4
@@ -39,18 +39,18 @@ _STILL_RAD = 5e-4
 
 @dataclass(frozen=True, slots=True)
 class FeedNote:
-    """An event of the stream, or the answer to a request."""
+    """An event of the stream, or the answer to a request of the operator, as screen and page show it."""
 
     t_host_ns: int | None
     text: str
     kind: str = ""
-    """Kind of the event; for an answer "failed", "warning" or empty."""
+    """Kind of the event; for the answer to a request "failed", "warning" or empty."""
     times: int = 1
-    """Number of consecutive occurrences."""
+    """How often this note occurred in a row."""
 
     @property
     def words(self) -> str:
-        """The text, followed by the number of occurrences if there are several."""
+        """The text of the note, followed by the number of its occurrences if there are several."""
         return self.text if self.times == 1 else f"{self.text} ({self.times} times)"
 
 
@@ -76,7 +76,7 @@ class Feed(Sink):
         """(6,) standard deviations: of a mean over `MEAN_S` under the current contact, of such a mean of a free tool,
         and of one sample of a free tool. Updated every 50 ms, like the status."""
         self.newest_ns: int | None = None
-        """Time of the newest sample."""
+        """Time of the newest sample on the cell's clock; None before the first."""
         self.turned_ns = stream.clock.now_ns()
         """Time of the last read of the stream, even if it returned no samples."""
         self.recorded: list[Path] = []
@@ -90,12 +90,12 @@ class Feed(Sink):
         self._requests: SimpleQueue[Callable[[], object]] = SimpleQueue()
 
     def subscribe(self) -> tuple[deque[Block], deque[FeedNote]]:
-        """Return the queues of blocks and notes of a new reader, filled from now on."""
+        """Return two queues for a new screen or page, which get the blocks and the notes from now on."""
         self._readers.append((deque(maxlen=_MOST_BLOCKS), deque(maxlen=_MOST_NOTES)))
         return self._readers[-1]
 
     def do(self, action: Callable[[], object]) -> None:
-        """Call `action` between two reads, in the thread that reads the stream; its error becomes a note."""
+        """Let the thread that reads the stream call `action` between two reads; an error of it becomes a note."""
         self._requests.put(action)
 
     def note(self, text: str, kind: str = "") -> None:
@@ -231,15 +231,15 @@ class PlotColumns:
     """A time span divided into columns of equal duration, oldest first."""
 
     low: Array
-    """(6, n) smallest value; NaN in a column without samples."""
+    """(6, n) smallest value in each column; NaN in a column without samples."""
     high: Array
-    """(6, n) largest value; NaN in a column without samples."""
+    """(6, n) largest value in each column; NaN in a column without samples."""
     in_contact: NDArray[np.bool_]
     """(n,) whether the column contains a contact."""
     start_ns: int
     column_ns: int
     marks: set[int]
-    """Indices of the columns with a mark, a tare, a gap or a change of stages."""
+    """Indices of the columns that contain a mark, a tare, a gap or a change of stages."""
 
     @property
     def span_s(self) -> float:

@@ -39,28 +39,28 @@ from ftcalib.rounding import with_sigma
 from ftdrive.stream.noise import GYRATION_M, REST, STATES, NoiseEstimator, Window, Windows
 from ftdrive.stream.samples import Paired, StreamEvent, StreamInfo, Tracked
 
-# Parts of the state vector.
+# Slices of the state vector: bias, its drift rate, local error of the calibration, held part.
 _BIAS, _RATE, _LOCAL, _PART = slice(0, 6), slice(6, 12), slice(12, 18), slice(18, 22)
 # Scales of force and torque of a typical sensor, N and N·m, which convert limits in N to torques.
 _UNIT = np.repeat([1.0, 0.03], 3)
 ANY_BIAS = np.square(_UNIT)
 """Variance (6,) added when tracking begins, because the bias may have changed by more than the drift explains."""
-# Candidate random walks of the bias within an hour, one sigma, N; the last two for warming or worn sensors.
+# Candidate sizes of the bias's random walk within an hour, one sigma, N; the last two for warming or worn sensors.
 WALKS_N = (0.03, 0.1, 0.3, 1.0, 3.0)
-# Time constant of forgetting for the likelihoods of the walks, because the bias of a warm sensor walks less.
+# Time constant, s, with which the walks' likelihoods are forgotten, because a sensor that has warmed up walks less.
 _FORGET_S = 3600.0
-# Typical drift of the bias within an hour, one sigma, N; the drift rate may change by as much within an hour.
+# Typical drift of the bias within an hour, one sigma, N. Within an hour the drift rate may change by this per hour.
 _RATE_N = 5.0
 _RATE_VARIANCE = np.square(_RATE_N / 3600 * _UNIT)
-# Correlation angle of the calibration error: weights vary with the sine of the angle, cable forces faster.
+# Turn of the arm, rad, over which the local error of the calibration decorrelates to 1/e.
 _LOCAL_RAD = 0.5
 # Gate on the squared innovation of a window; a free tool exceeds it about once an hour.
 _GATE = float(chdtri(6, 1e-4))
 # Degrees of freedom of Student's distribution: outliers get less weight, because vibration has heavy tails.
 _TAILS = 4.0
-# Limit of the squared distance between two parts, with four estimated parameters.
+# Below this squared Mahalanobis distance two estimates (mass and moment, four numbers) count as the same part.
 _SAME = float(chdtri(4, 1e-3))
-# Smallest and largest number of consecutive windows that determine a part; older windows are dropped.
+# Smallest and largest number of consecutive windows from which a held part is determined; older ones are dropped.
 _RUN, _LONGEST_RUN = 4, 24
 # A new part is accepted after gravity has turned by this angle in sensor axes, or the arm has moved this far: a contact
 # stays in place. A steady force along gravity that moves with the arm looks like a part.
@@ -68,38 +68,38 @@ _TURN_RAD, _TRAVEL_M = 0.25, 0.15
 # A window is used only after this many further windows fit the state, because the start of a contact may be too small
 # to detect. A contact that begins slowly therefore does not change the bias.
 _GUARD = 2
-# Largest drift of the trusted bias within an hour, N: four sigmas of a typical drift. For sensors with a known larger
-# drift or walk the limit grows in proportion.
+# Most by which the trusted bias follows the estimate within an hour, N: four sigmas of a typical drift. For sensors
+# with a known larger drift or walk it is larger in proportion.
 _TRUSTED_N = 20.0
-# An estimate farther from the trusted bias than this, N, or than this many sigmas, may contain a slow contact: 3 N that
-# grow within 300 s are then detected before they have changed the bias by 0.5 N.
+# A bias farther from the trusted bias than both this, N, and this many sigmas may contain a slow contact: 3 N that grow
+# within 300 s are then detected before they have changed the trusted bias by 0.5 N.
 _DOUBTFUL_N, _DOUBTFUL_SIGMAS = 0.2, 3.0
-# Assumed random walk of a new sensor within an hour, N, and the time constant of its estimate, s.
+# Random walk within an hour, N, assumed before it is known; and time constant, s, with which its estimate replaces it.
 _USUAL_WALK_N, _WALK_KNOWN_S = 1.0, 1800.0
-# Drift allowed at a tare, one sigma, N.
+# Drift of the bias up to a tare, one sigma, N, so that the tare may change the bias by more than tracked.
 _TARED_N = 0.5
-# For the contact test, the bias uncertainty grows for no longer than this, because a long contact is not a drift.
+# In the contact test, the uncertainty of the bias grows for this time, s, of a contact only: a long one is no drift.
 _CONTACT_S = 30.0
-# A drift is reported if it exceeds this many sigmas.
+# A drift rate of the bias is reported if it exceeds this many of its sigmas.
 _WARNED_SIGMAS = 5.0
 NOTHING_KG = 0.02
-"""A smaller mass counts as no part, kg."""
+"""Below this mass, kg, the gripper counts as empty."""
 # Sigma of mass and of mass times centre of mass of an unknown part, kg and kg m.
 _ANY_PART = np.array([5.0, 0.5, 0.5, 0.5])
 # Covariance of mass and moment of an empty gripper. The state gets a hundredth of it, so that the bias takes the rest.
 _NO_PART = np.diag(np.square([2e-3, 2e-4, 2e-4, 2e-4]))
 _EMPTY = _NO_PART / 100
-# Relative sigma of the sensor's reading of a part.
+# Relative sigma of the mass and moment of a held part, for the error of the sensor that weighed it.
 _PART_READ = 0.02
-# The torque is linearised about the centre of mass of the part if its sigma is less than this.
+# The torque of a part is linearised about its centre of mass if the sigma of that is below this, m.
 _PLACED_M = 0.03
-# Prior weight of the expected noise, in windows: small, because a window shows less vibration than the readings from
-# which the noise is predicted. The estimate averages over at most the second number of windows.
+# Weight of the expected noise in the estimate, in windows: small, because a window shows less vibration than the
+# readings from which that noise is predicted. The estimate averages over at most the second number of windows.
 _FIRST_WINDOWS, _MOST_WINDOWS = 3, 200
 
 
 class _State(NamedTuple):
-    """Mean (22,) and covariance (22, 22) at a time and in an orientation, combined or per random walk (n, …)."""
+    """Filter state at a time and orientation: mean (22,) and covariance (22, 22), or one of each per walk (n, …)."""
 
     x: Array
     P: Array
@@ -144,16 +144,16 @@ class FreeToolFilter:
         self._walk = np.square(self._walks_N[:, None] * _UNIT) / 3600.0
         self._likelihood, self._weights = np.zeros(n), np.full(n, 1 / n)
         self._t_s, self._seen_s = np.nan, -np.inf
-        # Per state of motion: number of windows, and sum of the outer products of their residuals.
+        # Noise per state of motion: number of windows, and sum of the outer products of their residuals.
         self._noise: list[tuple[float, Array]] = [(0.0, np.zeros((6, 6)))] * STATES
-        # Windows that fit the state but are not used yet.
+        # Windows that fit the state, but wait until further windows fit too.
         self._queue: list[Window] = []
-        # Time at which the interruption began.
+        # Time at which the current interruption (an undecided contact or grasp) began; None without one.
         self._open_s: float | None = None
         self._peak_N = 0.0
-        # State before an interruption, and mean and covariance of its part.
+        # Filter state before an interruption, and mean and covariance of the part held before it.
         self._held, self._before = self._state, (np.zeros(4), _EMPTY)
-        # Latest windows of an interruption that agree on one part.
+        # Latest windows of an interruption that agree on one held part.
         self._run: list[_WindowFit] = []
         self._drift_N_h = np.maximum(_TRUSTED_N, _force_sizes(drift_per_h))
         self._known_walk_N = _USUAL_WALK_N
@@ -162,8 +162,8 @@ class FreeToolFilter:
         self._is_doubtful = self._is_warned = False
         self._subtracted = np.zeros(6)
         self.changes = 0
-        """Number of changes of the state so far."""
-        # States before each tare, to undo the tare.
+        """Number of changes of the filter state so far: values computed from the state depend on it."""
+        # Filter state and trusted bias before each tare, to undo the tare.
         self._untared: list[tuple[_State, Array]] = []
 
     # ------------------------------------------------------------------------------------------- prediction
@@ -191,11 +191,11 @@ class FreeToolFilter:
         return norm, float(np.sqrt(weights @ variance))
 
     def warning(self, usual_N_h: float) -> tuple[str, Mapping[str, JSON]] | None:
-        """Return the text and values of a drift event, once, if the drift exceeds the usual one and five sigmas."""
+        """Return text and values of a drift event, once, if the drift exceeds both `usual_N_h` and five sigmas."""
         rate, sigma = self.force_rate_N_h
         worth = max(usual_N_h, _WARNED_SIGMAS * sigma)
         before = self._is_warned
-        # a drift ends at half the limit, so that a drift near the limit is reported only once
+        # the drift counts as over at half the limit, so that one that stays near the limit is reported only once
         self._is_warned = rate > (0.5 if before else 1.0) * worth
         if rate <= worth or before:
             return None
@@ -212,7 +212,7 @@ class FreeToolFilter:
         self._trusted_sigma = np.hypot(self._trusted_sigma, np.sqrt(variance))
 
     def subtract(self, change: Array) -> None:
-        """Register a change (6,) of the bias that the stream subtracts in addition to that of the calibration."""
+        """Register a change (6,) of the bias that the stream subtracts from now on, besides that of the calibration."""
         self._subtracted = self._subtracted + change
         self.changes += 1
 
@@ -239,7 +239,7 @@ class FreeToolFilter:
         self._open_s, self._queue, self._run, self._is_doubtful = None, [], [], False
 
     def hold(self, part: Array, covariance: Array) -> None:
-        """Set mass and moment (4,) of the held part as known; zero for an empty gripper."""
+        """Set mass, and mass times centre of mass, of the held part (4,) as known; zeros for an empty gripper."""
         self._state.x[:, _PART] = part
         self._state.P[:, _PART], self._state.P[:, :, _PART] = 0.0, 0.0
         self._state.P[:, _PART, _PART] = covariance + _EMPTY + np.diag(np.square(_PART_READ * part))
@@ -248,7 +248,7 @@ class FreeToolFilter:
     # ----------------------------------------------------------------------------------------------------- windows
 
     def update(self, window: Window) -> Tracked:
-        """Update the state with the next window, and return the estimate."""
+        """Update the filter with the next window, and return the estimated bias and held part."""
         dt_s, self._t_s = _time_step_s(window.t_s, self._t_s), window.t_s
         if np.isnan(self._state.t_s):
             self._state = self._state._replace(t_s=window.t_s)
@@ -288,13 +288,13 @@ class FreeToolFilter:
         return self._ahead(state, window.t_s, window.R_base_flange, window.systematic)
 
     def _doubtful(self, variance: Array) -> Array:
-        """Return the limits (2,) of the distance between bias and trusted bias, in the form of `_force_sizes`."""
+        """Return limits (2,) for the distance of the bias from the trusted bias: force, and torque scaled to N."""
         return np.maximum(
             _DOUBTFUL_N * max(self._known_walk_N, 1.0), _DOUBTFUL_SIGMAS * _force_sizes(np.sqrt(variance))
         )
 
     def _trust(self, bias: Array, variance: Array, dt_s: float) -> tuple[Array, list[StreamEvent]]:
-        """Move the trusted bias towards the estimate, as fast as drift allows; return variance (6,) and events."""
+        """Move the trusted bias towards the estimate, as fast as drift allows; return bias variance (6,) and events."""
         sigma, limit = np.sqrt(variance), self._doubtful(variance)
         off = bias - self._trusted
         if self._is_doubtful and (_force_sizes(off) < limit / 2).all():
@@ -305,7 +305,7 @@ class FreeToolFilter:
             most = self._drift_N_h * max(self._known_walk_N, 1.0) * dt_s / 3600
             most = most + 3 * _force_sizes(self._trusted_sigma - seen)
             self._trusted_sigma = seen
-            # Use the same factor for all axes, because a contact acts on several.
+            # All axes move by the same fraction, because a contact acts on several of them.
             self._trusted = self._trusted + off / max(1.0, float((_force_sizes(off) / np.maximum(most, 1e-12)).max()))
             off = bias - self._trusted
             walk_N = float(self._weights @ self._walks_N)
@@ -323,7 +323,7 @@ class FreeToolFilter:
         return variance + beyond**2, [StreamEvent(round(self._t_s * 1e9), "drift", text, values)]
 
     def _follow(self, window: Window) -> list[StreamEvent]:
-        """Use a window while the part is known, or begin an interruption."""
+        """Queue a window that fits the state, and use an earlier one; a window that does not begins an interruption."""
         now = self._at(self._mixed(self._state), window)
         if self._compared(now, window, _part_com(now))[0] < _GATE:
             self._queue.append(window)
@@ -337,7 +337,7 @@ class FreeToolFilter:
         x[:, _PART] = 0.0
         P[:, _PART], P[:, :, _PART] = 0.0, 0.0
         P[:, _PART, _PART] = np.diag(_ANY_PART**2)
-        if self._is_doubtful:  # a slow contact may end suddenly
+        if self._is_doubtful:  # the bias may contain a slow contact, which may end suddenly
             _diagonal(P)[:, _BIAS] += np.square(mean[_BIAS] - self._trusted)
             x[:, _BIAS], x[:, _RATE] = self._trusted, 0.0
             P[:, _RATE], P[:, :, _RATE] = 0.0, 0.0
@@ -347,7 +347,7 @@ class FreeToolFilter:
         return self._decide(window)
 
     def _count(self, window: Window) -> None:
-        """Update the state with a window, and the estimate of its noise."""
+        """Update the filter with a window that was accepted, and the noise of the window's state of motion."""
         dt_s = _time_step_s(window.t_s, self._state.t_s)
         now = self._at(self._state, window)
         mixed = self._mixed(now)
@@ -364,7 +364,7 @@ class FreeToolFilter:
         self._seen_s = window.t_s
 
     def _decide(self, window: Window) -> list[StreamEvent]:
-        """End an interruption if the latest windows agree on a part."""
+        """Add a window to an interruption; end it if the latest windows agree on what the gripper holds."""
         before = self._mixed(self._state).x
         before[_PART] = self._before[0]
         left_N = (window.residual - _observation(window, None) @ before)[:3]
@@ -382,7 +382,7 @@ class FreeToolFilter:
             windows = windows[(len(windows) + 1) // 2 :]
             run = self._extended([], windows)
         self._run = run
-        # the first and last windows are left out, because a contact may begin and end too slowly to detect
+        # the first and last windows are left out: they may contain a contact too small to detect
         inner = [fit.window for fit in run][_GUARD:-_GUARD]
         if len(inner) < _RUN or self._decided(run[-1 - _GUARD].state) is None:
             return []
@@ -393,7 +393,7 @@ class FreeToolFilter:
     def _extended(
         self, run: list[_WindowFit], windows: Sequence[Window], place: Array | None = None
     ) -> list[_WindowFit] | None:
-        """Return the run with more windows, or None if one of them does not agree with the run."""
+        """Return the run of agreeing windows with more windows, or None if one of them does not agree."""
         run, state = list(run), self._state
         for window in windows:
             if run:
@@ -407,7 +407,7 @@ class FreeToolFilter:
         return run
 
     def _decided(self, state: _State) -> _State | None:
-        """Return the state after a run for the previous part, no part or a new part that has moved; else None."""
+        """Return the state if a run shows the previous part, no part, or a new part that was moved; otherwise None."""
         mean, covariance, *_ = self._mixed(state)
         for part, part_P in (self._before, (np.zeros(4), _EMPTY)):
             off = mean[_PART] - part
@@ -421,7 +421,7 @@ class FreeToolFilter:
         t_ns = round(begin_s * 1e9)
         self._state, self._queue, self._run, self._seen_s = state, queue, [], queue[0].t_s
         mean, covariance, *_ = self._mixed(state)
-        # a slow contact has ended if the bias returns to within twice the limit of the trusted bias
+        # a slow contact has ended if the bias is within twice its limit of the trusted bias again
         if (
             self._is_doubtful
             and (_force_sizes(mean[_BIAS] - self._trusted) < 2 * self._doubtful(np.diag(covariance)[_BIAS])).all()
@@ -443,7 +443,7 @@ class FreeToolFilter:
         return turned or bool(np.linalg.norm(gone - gone[0], axis=1).max() > _TRAVEL_M)  # NaN: unknown position
 
     def _mixed(self, state: _State) -> _State:
-        """Return the weighted mean over the walks. Predicting from it is exact, because each step is linear."""
+        """Combine the states of all walks into their weighted mean. Prediction from it is exact, as it is linear."""
         weights = self._weights
         mean = weights @ state.x
         off = state.x - mean
@@ -466,29 +466,29 @@ class FreeToolFilter:
         return np.asarray(C)
 
     def _compared(self, state: _State, window: Window, place: Array | None) -> tuple[float, Array, Array]:
-        """Return the squared distance of a window, its observation matrix H, and its noise covariance."""
+        """Return a window's squared distance from the prediction, its observation matrix H and its noise covariance."""
         H, C = _observation(window, place), self._covariance(window, state.x[_PART])
         left = window.residual - H @ state.x
         return float(left @ np.linalg.solve(H @ state.P @ H.T + C, left)), H, C
 
 
 def _force_sizes(wrench: Array) -> Array:
-    """Return the norms (2,) of force and torque, N; the torque is scaled to that of a typical sensor."""
+    """Return the norms (2,) of force and torque, N; 0.03 N·m, as of a typical sensor, count as 1 N."""
     return np.asarray(np.sqrt(np.square(wrench / _UNIT).reshape(2, 3).sum(axis=1)))
 
 
 def _time_step_s(t_s: float, before_s: float) -> float:
-    """Return the time difference, s; 0 for the first time and for a jump back within a recording."""
+    """Return the time since `before_s`, s; 0 if that is NaN, or after a jump back within a recording."""
     return t_s - before_s if t_s > before_s else 0.0
 
 
 def _inflation(distance: float) -> float:
-    """Return the factor on the noise covariance of a window at this squared distance, for Student's distribution."""
+    """Return the factor on a window's noise covariance that gives it the weight of Student's distribution."""
     return max(1.0, (_TAILS + distance) / (_TAILS + 6))
 
 
 def _correct(state: _State, y: Array, covariance: Array, H: Array) -> tuple[_State, Array]:
-    """Return the state of each walk after a measurement, and the log likelihoods (n,)."""
+    """Return the state of each walk after a Kalman update by measurement `y`, and its log likelihood (n,)."""
     HP, left = H @ state.P, y - state.x @ H.T
     S = HP @ H.T + covariance
     inverse = np.linalg.inv(S)
@@ -503,17 +503,17 @@ def _diagonal(matrix: Array) -> Array:
     return diagonal
 
 
-# Matrices of the prediction: the constant part, the drift per second, and the part that decays with rotation.
+# Transition matrices of the state: its constant part, drift per second, and the part that decays with rotation.
 _KEPT, _DRIFTS, _TURNS = np.eye(22), np.eye(22, k=6), np.zeros((22, 22))
 _DRIFTS[6:] = _KEPT[_LOCAL] = 0.0
 _TURNS[_LOCAL, _LOCAL] = np.eye(6)
-# Matrix from the state to the residual of a free tool.
+# Matrix (6, 22) from the filter state to the residual of a free tool without a held part.
 _FREE = np.zeros((6, 22))
 _FREE[:, _BIAS] = _FREE[:, _LOCAL] = np.eye(6)
 
 
 def _observation(window: Window, p_sensor_m: Array | None) -> Array:
-    """Return the matrix (6, 22) from state to residual, linearised about the part's centre of mass if known."""
+    """Return the matrix (6, 22) from filter state to residual, linear about the part's centre of mass if known."""
     place_m = window.p_sensor_near_m if p_sensor_m is None else p_sensor_m
     of_part = np.zeros((6, 4))
     # A bias is constant in sensor axes and a weight turns with gravity, so only motion distinguishes the two.
@@ -525,7 +525,7 @@ def _observation(window: Window, p_sensor_m: Array | None) -> Array:
 
 
 def _part_com(state: _State) -> Array | None:
-    """Return the centre of mass of the part (3,); None if it is too uncertain to linearise the torque about."""
+    """Return the held part's centre of mass (3,); None if too uncertain for linearising the part's torque about it."""
     mass_kg, moment_kg_m = state.x[_PART][0], state.x[_PART][1:]
     placed = mass_kg > NOTHING_KG and float(np.trace(state.P[_PART, _PART][1:, 1:])) < (_PLACED_M * mass_kg) ** 2
     return moment_kg_m / mass_kg if placed else None
@@ -538,7 +538,7 @@ _REPORT_S = 1.0
 
 
 class Following:
-    """Runs the filter over a stream; `growth` returns the variance (6,) of the bias at a time in ns."""
+    """Runs the free-tool filter over a stream; `growth` returns the variance (6,) of the bias at a time in ns."""
 
     def __init__(self, info: StreamInfo, growth: Callable[[int], Array]) -> None:
         calibration = info.calibration
@@ -548,7 +548,7 @@ class Following:
         self.filter = FreeToolFilter(calibration.mass_kg, calibration.parameters.p_sensor_com_m, drift_per_h)
         self._reported_s = -np.inf
         self.found: list[tuple[Tracked, list[StreamEvent]]] = []
-        """Estimate and events after each window."""
+        """Estimate and events after each window, until the monitor of the tool takes them."""
         self._is_tracked = False
         self.tracked: Tracked | None = None
         """Newest estimate; None until tracking has begun and a window is complete."""
@@ -568,19 +568,19 @@ class Following:
             self.found.append((tracked, events))
 
     def begin(self) -> None:
-        """Start tracking: an existing offset is then treated as bias, not as contact."""
+        """Start tracking: an offset that exists now is taken for a change of the bias, not for a contact."""
         if not self._is_tracked:
             self._is_tracked = True
             self.filter.expect(ANY_BIAS)
 
     def hold(self, weight: Weight | None) -> None:
-        """Set the held part from a weighing; None empties the gripper."""
-        if weight is None or not weight.in_motion:  # a part weighed in motion comes from this filter
+        """Set the held part to a weighed load; None means that the gripper is empty."""
+        if weight is None or not weight.in_motion:  # a weighing in motion comes from this filter itself
             self.filter.hold(*((np.zeros(4), np.zeros((4, 4))) if weight is None else weight.moment))
 
 
 def weight_of(tracked: Tracked, calibration: CalibrationResult) -> Weight:
-    """Return the tracked part, even if zero, in the form of a weighing."""
+    """Return the tracked mass and centre of mass of the held part as a `Weight`, even if the mass is zero."""
     (x, covariance), mass_kg = tracked.moment, tracked.part_kg
     as_read, of_sensor, scale_sigma = tracked.moment, np.zeros((4, 4)), calibration.scale_sigma
     if (contact := calibration.known_contact) is not None:

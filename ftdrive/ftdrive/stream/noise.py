@@ -22,33 +22,33 @@ GYRATION_M = 0.08
 """Radius of gyration of a tool or part with unknown inertia, m."""
 REST = 0
 SPEEDS_RAD_S = (0.15, 0.4, 0.7)
-"""Limits of the speed classes: angular speed plus flange speed divided by 0.5 m, rad/s."""
+"""Limits between the speed classes of motion: angular speed plus flange speed divided by 0.5 m, rad/s."""
 ACCELERATION_RAD_S2 = 1.5
-"""Limit between the two acceleration classes: angular plus flange acceleration (centripetal excluded) / 0.5 m."""
+"""Limit between the two acceleration classes: angular plus flange acceleration (not centripetal) / 0.5 m."""
 SLOW = 2
 """Only the slow speed classes are divided by acceleration: at higher speeds ringing and ripple do not depend on it."""
 STATES = 1 + len(SPEEDS_RAD_S) + 1 + SLOW
-"""Number of states: rest, then the classes. The noise is estimated for each state."""
+"""Number of states of motion: rest, then the classes of motion. The noise is estimated for each state."""
 
 # Largest change between the means of two consecutive readings at rest; joint noise is 3e-5 rad.
 _STILL_RAD, _STILL_M = 2e-4, 2e-4
-# Displacement of the centre of mass, m, above which its inertial wrench is considered. Joint angles show motion later.
+# Displacement of the tool's centre of mass, m, above which its inertial wrench counts, before motion is detected.
 _FELT_M = 4e-5
-# Rest begins, and a state of motion ends, these times after the last sample in motion, s, because the links ring.
+# Rest begins the first time, s, after the last sample in motion, and a state of motion ends the second: the links ring.
 _HOLD_S, _RINGS_S = 0.5, 0.4
 _LEVER_M = 0.5
 _SPEEDS = np.array(SPEEDS_RAD_S)
 
-# Number of consecutive readings in a window at rest, and in a window in motion or in a short rest.
+# Number of consecutive readings in a window for the noise: at rest, and in motion or in a short rest.
 _WINDOW, _SHORT = 25, 8
-# Number of readings before a detected motion that are not used for the rest before it.
+# The last readings at rest before a detected motion, this many, are not used: the motion may have begun unseen.
 _UNSEEN = 4
 _WINDOWS = 60
 # A window whose noise exceeds the median by this factor contains a touch or a jolt, and is not used.
 _LOUD = {True: 1.5, False: 4.0}
-# A larger step between the means of two windows is the start or end of a contact.
+# A step between the means of two windows of more than this counts as start or end of a contact, not as noise.
 _STEP_SIGMAS = 5.0
-# Noise in motion until it is known: this multiple of the noise at rest, plus the noise of an acceleration.
+# Noise assumed in motion until it is measured: this multiple of that at rest, plus that of an acceleration, one sigma.
 _FIRST_MOTION, _FIRST_M_S2 = 10.0, 1.0
 _ENOUGH_DOF = 25.0
 # Degrees of freedom per reading, less than 1 because low-pass filters of sensors correlate consecutive readings.
@@ -56,7 +56,7 @@ _INDEPENDENT = 0.25
 
 
 def samples_in_reading(rate_Hz: float) -> int:
-    """Return the number of samples per reading."""
+    """Return the number of samples that are averaged in one reading, which takes `READING_S`."""
     return max(1, round(READING_S * rate_Hz))
 
 
@@ -72,16 +72,16 @@ class MotionTracker:
         self._step_s = self._size / rate_Hz
         self._hold = round(_HOLD_S * rate_Hz)
         by_acceleration = wrench_by_acceleration(mass_kg, parameters.p_sensor_com_m) @ parameters.R_flange_sensor.T
-        # (6, 3) inertial wrench per second difference of the centre of mass, flange axes, N/m and N.
+        # (6, 3) inertial wrench per second difference of the centre of mass positions, flange axes, N/m and N.
         self._felt_by_change = -by_acceleration / self._step_s**2
         self._p_flange_com_m = np.nan_to_num(p_flange_sensor_m) + parameters.R_flange_sensor @ parameters.p_sensor_com_m
         self._earlier: Array | None = None
-        # Samples since the last motion.
+        # Number of samples since the last one in motion.
         self._since = self._hold
         self._classes = np.zeros(round(_RINGS_S * rate_Hz), np.int8)
 
     def follow(self, R_base_flange: Array, p_base_flange_m: Array) -> tuple[NDArray[np.int8], Array]:
-        """Return the states (n,), `REST` or a class of motion, and the inertial wrench (n, 6) of visible motion.
+        """Return states of motion (n,), `REST` or a class, and the inertial wrench (n, 6) that the poses so far show.
 
         The wrench is in N and N·m, sensor axes; zero without visible motion. An unknown position is taken as constant.
         """
@@ -96,7 +96,7 @@ class MotionTracker:
             self._earlier = np.repeat(poses[:, :1], 3 * k, axis=1)
         poses = np.concatenate([self._earlier, poses], axis=1)
         self._earlier = poses[:, n:].copy()
-        # use means, because the joint noise of single poses looks like motion
+        # use means over a reading, because the joint noise of single poses looks like motion
         sums = np.cumsum(poses, axis=1) / k
         moved = sums[:, 2 * k :] - 2 * sums[:, k:-k] + sums[:, : -2 * k]
         before, moved = moved[:, :n], moved[:, k:]
@@ -124,7 +124,7 @@ class MotionTracker:
 
     @staticmethod
     def _rate(moved: Array) -> Array:
-        """Return the displacement (n,) as an angle: rotation plus translation divided by `_LEVER_M`."""
+        """Return displacements (n,) as one angle, rad: rotation plus translation divided by `_LEVER_M`."""
         squares = np.square(moved)
         return np.asarray(np.sqrt(squares[:9].sum(axis=0) / 2) + np.sqrt(squares[9:].sum(axis=0)) / _LEVER_M)
 
@@ -149,11 +149,11 @@ class SensorNoise:
     sample: Array
     """(6, 6) covariance of one sample."""
     reading: Array
-    """(6, 6) covariance of the mean over `READING_S`, about its trend over half a second."""
+    """(6, 6) covariance of a reading, the mean over `READING_S`, about the linear trend of half a second."""
     wander: Array
-    """(6, 6) covariance of the slower part, from one half second to the next."""
+    """(6, 6) covariance of the slower part of the noise, which changes from one half second to the next."""
     dof: float
-    """Number of independent readings in the estimate."""
+    """Degrees of freedom: number of independent readings in the estimate."""
 
 
 class NoiseEstimator:
@@ -179,7 +179,7 @@ class NoiseEstimator:
         self._first = _FIRST_M_S2**2 * accelerated @ accelerated.T
 
     def of(self, state: int) -> SensorNoise | None:
-        """Return the noise in a state, assumed until about 1 s has been measured; None before the first half second."""
+        """Return the noise in a state of motion, assumed until measured for 1 s; None in the first half second."""
         known, rest = self._known.get(state), self._known.get(REST)
         other = rest or next(iter(self._known.values()), None)
         if state == REST or other is None:
@@ -264,13 +264,13 @@ def _about_line(n: int) -> Array:
 
 
 def variance_at_next_use(calibration: CalibrationResult) -> Array:
-    """Return the variance (6,) of each axis in any orientation beyond the predicted variance: misfit and drift."""
+    """Return the error variance (6,) per axis that misfit and drift add to the predicted one, in any orientation."""
     excess = np.square(calibration.likely_error("workspace")) - np.square(calibration.predicted_error())
     return np.repeat(excess.clip(0.0) / 3, 3)
 
 
 def unexplained_variance(calibration: CalibrationResult) -> Array:
-    """Return the variance (6,) of `variance_at_next_use`; zero if the noise explains the residuals."""
+    """Return `variance_at_next_use` (6,), or zeros if noise alone explains the residuals of the calibration."""
     return np.zeros(6) if calibration.noise_explains else variance_at_next_use(calibration)
 
 
@@ -279,13 +279,13 @@ def unexplained_variance(calibration: CalibrationResult) -> Array:
 # Ringing at 8 to 20 Hz leaves 0.06 N in plain means at the end of a move, and 0.01 N with Hann weights.
 WINDOW_S = 0.3
 """Duration of a window, s; windows overlap by half. Hann weights suppress the ringing of the links."""
-# The acceleration comes from poses at this spacing, with this many neighbours on each side.
+# The acceleration is computed from poses at this spacing, s, with this many neighbours on each side.
 _KNOT_S, _REACH = 0.004, 5
-# Error of a calibrated inertia tensor of the tool, relative to the error of an unknown one.
+# Assumed error of a calibrated inertia tensor of the tool, as a fraction of that of an unknown one.
 _TENSOR = 0.5
-# A window that is longer than usual by this factor has lost samples.
+# A window whose duration exceeds the usual one by this factor has lost samples, and is dropped.
 _LATE = 1.2
-# Degrees of freedom of the noise below which windows are dropped: the first half second may contain a push.
+# Windows are dropped until the noise estimate has these degrees of freedom: the first half second may contain a push.
 _LEAST_DOF = 10.0
 _ROW = np.dtype(
     [
@@ -297,9 +297,9 @@ _ROW = np.dtype(
     ],
     align=True,
 )
-# A change between two poses above this means lost samples.
+# A larger change between the poses of two consecutive samples means that samples were lost.
 _JUMP = 0.1
-# Sigma of the acceleration in motion of an arm that reports no positions, m/s².
+# Sigma of the acceleration, m/s², assumed in motion for an arm that reports no positions.
 _UNKNOWN_M_S2 = 1.0
 # Ratio of the variances of a window's mean and of a reading for white noise; for vibration the ratio is smaller.
 _LIKE_WHITE = 1.5 * READING_S / WINDOW_S
@@ -307,31 +307,31 @@ _LIKE_WHITE = 1.5 * READING_S / WINDOW_S
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """Weighted mean of the samples of a short time."""
+    """Weighted mean of the samples of `WINDOW_S`, the measurement of the free-tool filter."""
 
     t_s: float
     residual: Array
-    """(6,) measured minus predicted wrench of the tool alone, N and N·m, sensor axes."""
+    """(6,) measured wrench minus that predicted for the tool without a held part, N and N·m, sensor axes."""
     felt_m_s2: Array
     """(3,) gravity minus acceleration of the sensor origin, sensor axes."""
     lever_s2: Array
     """(3, 3) acceleration of a point per unit of its position relative to the sensor origin, as the sensor turns."""
     p_sensor_near_m: Array
-    """(3,) position at which the gripper holds parts."""
+    """(3,) point at which the gripper holds parts, sensor frame."""
     noise: Array
-    """(6, 6) noise covariance expected before it is estimated from windows."""
+    """(6, 6) noise covariance of the window, used until it is estimated from windows."""
     state: int
-    """Fastest state of motion, as `MotionTracker.follow` returns it."""
+    """Fastest state of motion among the samples, as `MotionTracker.follow` returns it."""
     systematic: Array
-    """(6, 6) covariance of the prediction in this orientation."""
+    """(6, 6) covariance of the wrench predicted for the tool in this orientation."""
     turning_rad_s2: float
-    """Mean angular acceleration."""
+    """Mean angular acceleration of the tool."""
     tensor_Nm: float
     """Sigma of the torque exerted by the unknown part of the tool's inertia."""
     R_base_flange: Array
     p_base_flange_m: Array
     as_read: Array
-    """(6, 6) response of the sensor to the wrench of a part."""
+    """(6, 6) matrix by which the sensor's reading of a held part differs from the part's true wrench."""
 
 
 class Windows:

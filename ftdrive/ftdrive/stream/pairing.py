@@ -20,41 +20,41 @@ from ftcalib.motion.samples import RATE_TOLERANCE, SampleClock
 from ftdrive.stream.samples import Ns, Paired, matrices, quaternions
 from ftdrivers.interfaces import ArmStates, Array, FtSamples
 
-# A device clock whose rate differs by this share over this time does not count real seconds.
+# A device's clock does not count real seconds if its rate is off by this fraction over this time, s.
 _SCALED_S, _SCALED = 0.2, 0.05
 _PASSES = 4
 _ROUNDS = 10
-# Pairing of a recording is repeated until its delay changes by less than this.
+# A recording is paired again until its estimated delay changes by less than this.
 _CONVERGED_S = 1e-8
 # A pose is extrapolated by at most one interval of a CB3 controller plus some delay: waiting for the next pose would
 # delay a block by one interval and split it.
 _MOST_AHEAD_NS = 10_000_000
-# Poses are kept this long for late samples.
+# Poses are kept for this time, so that samples that arrive late still find theirs.
 _KEEP_NS = 2_000_000_000
 MOST_DELAY_S = 0.1
 
 PERIOD_S = 0.024
 """Samples are averaged over this time, s: over shorter times, noise of the poses looks like acceleration."""
 _BATCH_S = 1.0
-# The acceleration comes from this many neighbours on each side.
+# The acceleration is computed from this many neighbouring mean poses on each side.
 _REACH = 2
 # Weights that smooth the force like the acceleration, which comes from parabolas through five mean poses.
 _SAME = np.convolve([2, 3, 2], [1, 10, 1]) / 84
-# The estimate is applied below this sigma, computed without the most informative second.
+# The estimated delay is applied once its sigma, computed without the most informative second, is below this, s.
 _USABLE_S = 3e-3
 # Below this angular speed, the motion does not show the delay.
 _SLOWEST_RAD_S = 0.02
-# Sigma of the delay before the first estimate: without and with the delay of a calibration in motion.
+# Sigma of the delay before its first estimate: without a prior delay, and with that of a calibration in motion.
 _PRIOR_S, _SAME_LINKS_S = 0.05, 0.005
-# Change of the bias since the calibration, one standard deviation.
+# Change of the force bias since the calibration, N, one standard deviation.
 _BIAS_N = 0.5
 # Weight of a held part relative to the weight of the tool, one standard deviation.
 _HELD = 0.05
-# Sigma of the configured sensor origin; `_ANY_LEVER_M` if it is not configured.
+# Sigma of the sensor's origin relative to the flange if it is configured; `_ANY_LEVER_M` if it is not.
 _LEVER_M = 0.005
 _ANY_LEVER_M = 0.1
 _FLOOR_N = 1e-3
-# After a larger change the samples of the next second are not used, because the times follow the change slowly.
+# After a larger change of the delay the next second is not used, because the samples' times follow the change slowly.
 _NOTICED_S = 2e-4
 
 
@@ -71,12 +71,12 @@ class PoseTrack:
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
-        """First and last time; None while there is no pose."""
+        """Times of the first and the last pose; None while there is no pose."""
         return (int(self._t_ns[0]), int(self._t_ns[-1])) if len(self._t_ns) else None
 
     @property
     def ahead_ns(self) -> int:
-        """Time after the last pose by which it may be extrapolated with constant velocity."""
+        """Time after the last pose up to which the pose may be extrapolated with constant velocity."""
         return min(int(self._t_ns[-1] - self._t_ns[-2]), _MOST_AHEAD_NS) if len(self._t_ns) > 1 else 0
 
     def add(self, t_host_ns: Ns, q_rad: Array, R_base_flange: Array, p_base_flange_m: Array) -> None:
@@ -158,7 +158,7 @@ class DelayEstimator:
         self.delay_s = 0.0 if motion is None else min(max(motion.delay_s, -MOST_DELAY_S), MOST_DELAY_S)
         """Delay used for pairing: the delay in the calibration, then the estimate once it is accurate enough."""
         self.sigma_s = _PRIOR_S if motion is None else _SAME_LINKS_S
-        """Standard deviation of the delay."""
+        """Standard deviation of `delay_s`."""
 
     def add(self, paired: Paired) -> None:
         """Update the estimate with samples that were paired with `delay_s`."""
@@ -245,7 +245,7 @@ class DelayEstimator:
             found = np.linalg.solve(total[:13, :13] + np.eye(13), total[:13, 13])
             left = np.append(-found, 1.0)
             variance = np.maximum(left @ products @ left / count, least)
-        # the most informative second may be a contact that looks like a delay
+        # leave out the most informative second once, because it may be a contact that looks like a delay
         both = np.array([total, total - weighted[np.argmax(weighted[:, 0, 0])]])[:, :13, :13] + np.eye(13)
         sigma_s, sigma_without_one_s = (_PRIOR_S * np.sqrt(np.linalg.inv(both)[:, 0, 0])).tolist()
         if sigma_without_one_s > _USABLE_S:
@@ -281,16 +281,16 @@ class Pairing:
 
     @property
     def delay_s(self) -> float:
-        """Delay of the wrench after the pose."""
+        """Delay of the sensor's samples after the arm's poses."""
         return self._estimator.delay_s if self._estimator else self._delay_s
 
     @property
     def delay_sigma_s(self) -> float:
-        """Standard deviation of the delay; 0 if it is configured."""
+        """Standard deviation of `delay_s`; 0 if the delay is configured."""
         return self._estimator.sigma_s if self._estimator else 0.0
 
     def use(self, estimator: DelayEstimator) -> None:
-        """Use an estimator with another calibration, and keep the current delay; a configured delay stays."""
+        """Replace the estimator by one for another calibration, but keep the current delay; keep a configured delay."""
         if self._estimator is not None:
             estimator.delay_s, estimator.sigma_s = self._estimator.delay_s, self._estimator.sigma_s
             self._estimator = estimator
@@ -329,7 +329,7 @@ class Pairing:
         self._waiting.append((samples, self._sensor.stamp(count, samples.t_host_ns)))
 
     def take(self) -> Paired | None:
-        """Return the samples whose pose is known; None if there is none.
+        """Return the waiting samples whose pose is known by now; None if there is none.
 
         Samples before the first pose are dropped.
         """
@@ -362,7 +362,7 @@ class Pairing:
 
 
 def _clock_of(states: ArmStates) -> SampleClock:
-    """Return the timeline of a controller from its first states; an emulated clock may run many times faster."""
+    """Return the timeline for a controller's first states; the clock of an emulated one may run many times faster."""
     host_s = float(states.t_host_ns[-1] - states.t_host_ns[0]) * 1e-9
     device_s = float(states.t_device_s[-1] - states.t_device_s[0])
     if host_s < _SCALED_S or abs(host_s / device_s - 1) < _SCALED:
