@@ -86,7 +86,7 @@ NOTHING_KG = 0.02
 """Below this mass, kg, the gripper counts as empty."""
 # Sigma of mass and of mass times centre of mass of an unknown part, kg and kg m.
 _ANY_PART = np.array([5.0, 0.5, 0.5, 0.5])
-# Covariance of mass and moment of an empty gripper. The state gets a hundredth of it, so that the bias takes the rest.
+# Covariance of mass and moment that an empty gripper seems to hold. The state has 1 % of it; the bias takes the rest.
 _NO_PART = np.diag(np.square([2e-3, 2e-4, 2e-4, 2e-4]))
 _EMPTY = _NO_PART / 100
 # Relative sigma of the mass and moment of a held part, for the error of the sensor that weighed it.

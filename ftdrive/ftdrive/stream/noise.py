@@ -30,7 +30,7 @@ SLOW = 2
 STATES = 1 + len(SPEEDS_RAD_S) + 1 + SLOW
 """Number of states of motion: rest, then the classes of motion. The noise is estimated for each state."""
 
-# Largest change between the means of two consecutive readings at rest; joint noise is 3e-5 rad.
+# Largest change of the mean pose between consecutive readings of a resting arm; joint noise is 3e-5 rad.
 _STILL_RAD, _STILL_M = 2e-4, 2e-4
 # Displacement of the tool's centre of mass, m, above which its inertial wrench counts, before motion is detected.
 _FELT_M = 4e-5
@@ -83,7 +83,7 @@ class MotionTracker:
     def follow(self, R_base_flange: Array, p_base_flange_m: Array) -> tuple[NDArray[np.int8], Array]:
         """Return states of motion (n,), `REST` or a class, and the inertial wrench (n, 6) that the poses so far show.
 
-        The wrench is in N and N·m, sensor axes; zero without visible motion. An unknown position is taken as constant.
+        The wrench is in N and N·m, sensor axes; zero if the poses show no motion. Unknown positions count as constant.
         """
         n, k = len(R_base_flange), self._size
         if not n:
@@ -170,7 +170,7 @@ class NoiseEstimator:
         self._size = samples_in_reading(rate_Hz)
         self._unread = np.empty((0, 7))
         self._at_rest = True
-        # Mean (6), scatter (6, 6) and state of each reading since the last window or change of rest and motion.
+        # Mean (6), scatter (6, 6) and state of motion per reading since the last window, or start or end of motion.
         self._open = np.empty((0, 43))
         self._mean_before: Array | None = None
         # Per window: scatter of readings, scatter of samples within readings, step from the previous window.
@@ -331,7 +331,7 @@ class Window:
     R_base_flange: Array
     p_base_flange_m: Array
     as_read: Array
-    """(6, 6) matrix by which the sensor's reading of a held part differs from the part's true wrench."""
+    """(6, 6) matrix from the true wrench of a held part to the wrench that the sensor reads."""
 
 
 class Windows:

@@ -52,10 +52,10 @@ from ftdrivers.interfaces import WRIST_SENSOR, Array
 
 SENSOR_FRAME = WrenchFrame()
 FALSE_ALARM_RATE = 1e-6
-"""Share of independent readings of a free tool that exceed the contact limit."""
-# Blocks with more samples than this are processed in chunks that fit the cache.
+"""Fraction of the independent readings of a free tool that exceed the contact limit."""
+# A block with more samples is processed in chunks of this many samples, which fit the processor's cache.
 _CHUNK_ROWS = 8192
-# A tracked bias is not applied if its sigma exceeds this, N and N·m.
+# A tracked bias is applied only while the sigma of each axis is below this, N and N·m.
 _APPLIED = np.repeat([0.1, 0.003], 3)
 
 
@@ -92,12 +92,12 @@ class ToolMonitor:
         self._tracker = ContactTracker(info.sensor_rate_Hz)
         self.following = Following(info, self.tool.bias_growth)
         self.contacts: list[Contact] = []
-        """Contacts that began or ended and have not been taken yet."""
+        """Contacts that began or ended, until `take_contacts` of the processor returns them."""
         self._is_learning = True
         self.state = REST
         self._newest_ns = 0
         self.reading = np.zeros(6)
-        """(6,) mean of the newest 20 ms minus the prediction for the free tool."""
+        """(6,) mean wrench of the newest 20 ms minus that predicted for the free tool."""
 
     # -------------------------------------------------------------------------------------------------------- samples
 
@@ -123,7 +123,7 @@ class ToolMonitor:
             self._noise.add(residual, states)
 
     def judge(self, residual: Array, passing: Passing) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the squared distances (n,) and contacts (n,) of samples with this residual (n, 6) of a free tool."""
+        """Return per sample its squared distance from a free tool, and whether in contact, for residuals (n, 6)."""
         rows, states = passing.rows, passing.states
         # bias, weight and inertia are subtracted even if their stages are off, because chi2 is defined for a free tool
         if (inertial := passing.inertial) is not None:
@@ -157,7 +157,7 @@ class ToolMonitor:
         return chi2, in_contact
 
     def covariance(self, noise: Array, settings: Stages, t_ns: int, *, loaded: bool) -> Array:
-        """Return the covariance (6, 6) of a wrench with the noise covariance `noise`, sensor axes."""
+        """Return the covariance (6, 6) of a compensated wrench, sensor axes: `noise`, prediction, bias and sensor."""
         covariance = noise
         if settings.gravity or settings.bias:
             covariance = covariance + self.test.uncertainty
@@ -192,7 +192,7 @@ class ToolMonitor:
         return None if self.track == "off" else self.following.tracked
 
     def reference(self) -> tuple[Calibrated, float]:
-        """Return the empty tool, and the time since its tare, s; infinite without a tare."""
+        """Return the empty tool with its bias, and the time since the last tare, s; infinite without a tare."""
         with self._lock:
             tare_ns = self.tool.tare_t_ns
             return self.tool.empty, math.inf if tare_ns is None else (self._newest_ns - tare_ns) * 1e-9
@@ -212,7 +212,7 @@ class ToolMonitor:
         self.test.restart()
 
     def warm(self, temperature_C: float) -> None:
-        """Correct the bias for this sensor temperature, if a model and the temperature at the calibration are known."""
+        """Correct the bias for a sensor temperature, if a model and the temperature at calibration are known."""
         if self.tool.is_warmed_by(temperature_C):
             self.following.filter.warm(self.tool.warm(temperature_C))
             if (warming := self.tool.warming()) is not None:
@@ -224,12 +224,12 @@ class ToolMonitor:
             self.end_contact()
             self.tool.hold(weight)
             self.following.hold(weight)
-            # The wrench of the motion depends on the load.
+            # The tracker computes the inertial wrench, which depends on the load.
             self._motion = self.tool.motion_tracker()
             self.test.restart()
 
     def restart(self) -> None:
-        """Discard the samples before an interruption; tares and drift remain."""
+        """Discard the samples before an interruption; the effects of tares and drift remain."""
         self.end_contact()
         self.test.restart()
         self._motion = self.tool.motion_tracker()
@@ -237,7 +237,7 @@ class ToolMonitor:
         self._neighbours.restart()
 
     def end_contact(self) -> None:
-        """End an open contact."""
+        """End a contact that is not over yet, and report it."""
         self._take(self._tracker.end())
 
     def turn_to(self, frame: FrameChange) -> None:
@@ -274,7 +274,7 @@ class Processor:
         self.stages: tuple[Stage, ...] = stages_of(self._settings, frame, info)
         """The stages applied to the raw wrench, in order."""
         self.events: list[StreamEvent] = []
-        """Events that have not been taken yet."""
+        """Events of the stream, until `take_events` returns them."""
         moved = np.zeros((6, 3))
         if not info.is_raw:
             moved = wrench_by_acceleration(info.calibration.mass_kg, info.calibration.parameters.p_sensor_com_m)
@@ -416,7 +416,7 @@ class Processor:
         self.stages = stages_of(self._settings, self._frame, self.info)
 
     def sigma_of_mean(self, R_base_flange: Array, duration_s: float = 0.0, *, loaded: bool = True) -> Array:
-        """Return the standard deviation (6,) of the newest sample in the frame, or of the mean over `duration_s`.
+        """Return the standard deviation (6,) of the newest sample in the frame, or of a mean over `duration_s`.
 
         NaN until the noise is known. `R_base_flange` (3, 3) is the orientation at the sample. The result grows with the
         age of the bias, if earlier runs of the sensor show how the bias changes. With `loaded` it contains the errors
@@ -437,12 +437,12 @@ class Processor:
 
     @property
     def rest_sigma(self) -> Array | None:
-        """(6,) standard deviation of one sample at rest; None until it is known."""
+        """(6,) standard deviation of one raw sample at rest, N and N·m, sensor axes; None until it is known."""
         noise = self._noise.of(REST)
         return None if noise is None else np.sqrt(np.diag(noise.sample))
 
     def status(self, links: Links) -> StreamStatus:
-        """Return the status of the stream with these links of its source."""
+        """Return the status of the stream, whose source has the given `links`."""
         if (monitor := self._monitor) is None:
             tare, tare_t_ns = self._zero or (None, None)
             return StreamStatus(*links, tare, tare_t_ns, 0.0, 0.0, math.inf, FALSE_ALARM_RATE)
@@ -466,7 +466,7 @@ class Processor:
         return contacts
 
     def take_event(self, event: StreamEvent) -> None:
-        """Add an event from the source."""
+        """Add an event that the source reports, such as a lost device."""
         self.events.append(event)
 
     def note(self, kind: EventKind, text: str, values: Mapping[str, JSON], t_ns: int | None = None) -> StreamEvent:
@@ -519,6 +519,6 @@ class Processor:
         return self._monitor.tool.tare_wrench
 
     def recent(self) -> Paired | None:
-        """Return the samples of the last half second; None before the first."""
+        """Return the samples of the last half second; None before the first sample."""
         with self._lock:
             return Paired.concatenate(list(self._recent)) if self._recent else None

@@ -17,16 +17,16 @@ from ftdrivers.interfaces import Array
 RAW, COMPENSATED, POSE, JOINTS = "/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states"
 TRANSFORMS = "/tf"
 WARNINGS = "tare-refused", "drift", "gap", "stale"
-"""Kinds of events that are logged as warnings."""
+"""Kinds of stream events that ROS 2 nodes and recordings log as warnings."""
 
 Messages = NDArray[np.void]
-"""(n,) messages of equal length; `tolist` converts them to bytes."""
+"""(n,) serialized messages of equal length; `tolist` returns them as bytes."""
 
 Transform = tuple[str, str, Array, Array]
-"""Parent, child, and the origin (3,) or (n, 3), m, and orientation (3, 3) or (n, 3, 3) of the child in the parent."""
+"""Parent frame, child frame, and the child's origin (3,) or (n, 3), m, and orientation (…, 3, 3) in the parent."""
 
 ENCODING = b"\0\1\0\0"
-"""First bytes of each message: CDR, little endian."""
+"""First bytes of each serialized message, which mean CDR encoding, little endian."""
 
 JOINT_NAMES = tuple(
     f"{joint}_joint" for joint in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -114,7 +114,7 @@ def pack_transforms(t_utc_ns: NDArray[np.int64], transforms: Sequence[Transform]
 
 
 def _stamps(t_utc_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return stamps (n,): seconds in the lower four bytes, nanoseconds in the upper ones."""
+    """Return ROS stamps (n,) as integers of 8 bytes: seconds in the lower four bytes, nanoseconds in the upper ones."""
     seconds, ns = np.divmod(t_utc_ns, 1_000_000_000)
     return np.asarray(seconds + (ns << 32))
 
@@ -132,7 +132,7 @@ def _pack_strings(*fields: str | int, start: int = 0) -> bytes:
 
 
 def _pack(*parts: bytes | NDArray[Any]) -> Messages:
-    """Join common first bytes, n stamps, and then numbers (n, k) or (1, k), further stamps and common bytes."""
+    """Join parts into n messages: each gets all bytes, and one row of each array of stamps (n,) or numbers (n, k)."""
     layout: list[Any] = [
         (f"{i}", f"V{len(part)}")
         if isinstance(part, bytes)

@@ -25,7 +25,7 @@ from ftdrivers.interfaces import Array, Columns, DeviceInfo
 Axes = Literal["sensor", "flange", "base", "tcp"]
 Point = Literal["sensor", "flange", "tcp"]
 Ns = NDArray[np.int64]
-# A sensor height from a calibration in motion is used if its sigma is smaller.
+# The sensor height that a calibration in motion estimated is used if its sigma is smaller than this.
 _KNOWN_HEIGHT_M = 3e-3
 
 
@@ -42,7 +42,7 @@ class WrenchFrame:
 
     axes: Axes = "sensor"
     about: Point | tuple[float, float, float] = "sensor"
-    """The origin of a frame, or a point (3,) relative to the flange in flange axes, m."""
+    """Reference point of the torque: the origin of a named frame, or a point (3,) in flange axes from the flange, m."""
 
     def __str__(self) -> str:
         if isinstance(self.about, str):
@@ -53,7 +53,7 @@ class WrenchFrame:
 
     @property
     def id(self) -> str:
-        """Name in messages: `sensor`, `base_at_tcp` or `base_at_0_0_0.15_m` (a point from the flange)."""
+        """Name of the frame in messages: `sensor`, `base_at_tcp` or `base_at_0_0_0.15_m` (a point from the flange)."""
         if self.axes == self.about:
             return self.axes
         if isinstance(self.about, str):
@@ -93,7 +93,7 @@ class Stages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Paired(Columns):
-    """n consecutive samples from the sensor, each with the pose at its time."""
+    """n consecutive samples from the sensor, each with the arm's pose at the time of the sample."""
 
     t_host_ns: Ns
     """(n,) time of measurement on the cell's clock: smoothed, and corrected for the delay between the links."""
@@ -102,9 +102,9 @@ class Paired(Columns):
     seq: Ns
     """(n,) sample numbers of the sensor; a missing number is a lost sample."""
     status: NDArray[np.uint32]
-    """(n,) the sensor's status word."""
+    """(n,) status word that the sensor sent with the sample."""
     raw: Array
-    """(n, 6) as measured, N and N·m, sensor axes, about the sensor origin."""
+    """(n, 6) wrench as measured, N and N·m, sensor axes, about the sensor origin."""
     q_rad: Array
     """(n, 6) joint angles, interpolated; NaN where unknown."""
     R_base_flange: Array
@@ -118,9 +118,9 @@ class Block(Paired):
     """Processed samples, all in one frame and with the same stages."""
 
     wrench: Array
-    """(n, 6) after `stages`, N and N·m, in `frame`."""
+    """(n, 6) wrench after all `stages`, N and N·m, in `frame`."""
     chi2: Array
-    """(n,) squared Mahalanobis distance of the last 20 ms from a free tool, with inertia subtracted as far as known."""
+    """(n,) squared Mahalanobis distance of the last 20 ms' mean from a free tool, known inertial wrench subtracted."""
     in_contact: NDArray[np.bool_]
     """(n,) whether in contact; see `Sample.in_contact`."""
     sigma: Array
@@ -157,7 +157,7 @@ class Sample(Displayed):
     force_sigma_N: Array
     torque_sigma_Nm: Array
     raw: Array
-    """(6,) as measured, sensor axes, about the sensor origin."""
+    """(6,) wrench as measured, N and N·m, sensor axes, about the sensor origin."""
     in_contact: bool
     """Whether the tool is in contact: from three consecutive readings beyond the limit until three within it.
 
@@ -169,12 +169,12 @@ class Sample(Displayed):
 
 
 def mean_rate_Hz(t_ns: NDArray[np.int64]) -> float:
-    """Return the mean rate of samples at these times (n,), n >= 2."""
+    """Return the mean rate, Hz, of samples that were measured at these times (n,), n >= 2."""
     return (len(t_ns) - 1) / max(float(t_ns[-1] - t_ns[0]) * 1e-9, 1e-9)
 
 
 def sensor_origin_m(height_mm: float | None, calibration: CalibrationResult | None = None) -> Array:
-    """Return `p_flange_sensor_m` (3,) of a sensor with this height above the flange face; NaN if unknown.
+    """Return the sensor's origin (3,), flange axes, m, for its height above the flange face; NaN if unknown.
 
     If no height is configured, the height from a calibration in motion is used if accurate.
     """
@@ -238,18 +238,18 @@ class Tracked(Displayed):
     bias: Array
     """(6,) change of the bias since the calibration, N and N·m, sensor axes."""
     sigma: Array
-    """(6,) standard deviation; it grows while the bias cannot be observed."""
+    """(6,) standard deviation of `bias`; it grows while the bias cannot be observed."""
     part_kg: float
     """Mass of the part in the gripper."""
     part_sigma_kg: float
     part_known: bool
-    """Whether the part is known; while a contact or a new part is undecided, `part_kg` is the previous part."""
+    """Whether the held part is known; during a contact or an undetermined new part, `part_kg` is that before it."""
     last_seen_s: float
     """Time since the last observation of the bias; infinite before the first."""
     walk_N: float
     """Estimated random walk of the force bias within an hour, one sigma."""
     moment: tuple[Array, Array]
-    """Mass and mass times centre of mass of the part (4,), kg and kg m, sensor axes, and their covariance."""
+    """The part's mass and mass times centre of mass (4,), kg and kg m, sensor axes, and their covariance (4, 4)."""
     events: tuple[StreamEvent, ...] = ()
     """Grasps, releases and contacts decided since the last update, with their start times."""
 
@@ -287,15 +287,15 @@ class StreamInfo(Displayed):
     sensor: DeviceInfo
     tool: str
     utc_offset_ns: int
-    """UTC minus the cell's clock: `t_host_ns + utc_offset_ns` is nanoseconds since 1970."""
+    """UTC minus the cell's clock: `t_host_ns + utc_offset_ns` is the time since 1970, UTC, in ns."""
     sensor_rate_Hz: float
     arm_rate_Hz: float
     p_flange_sensor_m: Array
-    """(3,) origin of the sensor, configured, because gravity cannot determine it."""
+    """(3,) origin of the sensor, flange axes, m, from the configuration, because gravity cannot determine it."""
     R_flange_tcp: Array
-    """(3, 3) orientation of the TCP."""
+    """(3, 3) orientation of the TCP in the flange."""
     p_flange_tcp_m: Array
-    """(3,) position of the TCP."""
+    """(3,) position of the TCP, flange axes, m."""
     versions: Mapping[str, str]
     verification: VerificationRecord | None = None
     """Last verification of the calibration before the stream was opened."""
@@ -330,16 +330,16 @@ class StreamInfo(Displayed):
 
 @dataclass(frozen=True, slots=True)
 class LinkStatus:
-    """Status of one device of the stream."""
+    """Status of the connection to one device of the stream, sensor or arm."""
 
     rate_Hz: float
-    """Rate over the last second."""
+    """Rate of the device's samples over the last second."""
     nominal_rate_Hz: float
     lost: int
     age_s: float
-    """Time since the newest sample."""
+    """Time since the newest sample of the device."""
     error: str = ""
-    """Why no samples arrive; empty while they do."""
+    """Why no samples of the device arrive; empty while they do."""
 
 
 class Links(NamedTuple):
@@ -348,9 +348,9 @@ class Links(NamedTuple):
     sensor: LinkStatus
     arm: LinkStatus
     delay_s: float
-    """Delay of the wrench after the pose."""
+    """Delay of the sensor's samples after the arm's poses."""
     delay_sigma_s: float
-    """Standard deviation of the delay; 0 if it is configured."""
+    """Standard deviation of `delay_s`; 0 if the delay is configured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -365,10 +365,10 @@ class StreamStatus(Displayed):
     """(6,) change of the bias by tares, N and N·m, sensor axes; None without a tare."""
     tare_t_host_ns: int | None
     drift_N_h: float
-    """Drift of the force bias while the tool is free."""
+    """Estimated drift rate of the force bias, norm."""
     drift_sigma_N_h: float
     contact_limit: float
-    """Limit of `Block.chi2`."""
+    """Readings with a larger `Block.chi2` count towards a contact."""
     false_alarm_rate: float
     tracked: Tracked | None = None
     """Tracked bias and part; None unless the stream tracks them."""
@@ -380,7 +380,7 @@ class StreamStatus(Displayed):
 
 
 def find_gaps(rows: Paired, seq_before: int | None) -> list[StreamEvent]:
-    """Return an event per gap in the sample numbers; `seq_before` is the number before the first sample."""
+    """Return an event per gap in the sample numbers of rows; `seq_before` is the number of the sample before them."""
     before = int(rows.seq[0]) - 1 if seq_before is None else seq_before
     if int(rows.seq[-1]) - before == len(rows):
         return []
@@ -415,7 +415,7 @@ class FrameTransform:
         self._turns = frame.axes == "base"
 
     def __call__(self, wrench: Array, R_base_flange: Array) -> Array:
-        """Return wrenches (n, 6) in the frame; `R_base_flange` is (n, 3, 3)."""
+        """Transform wrenches (n, 6) from sensor axes to the frame; `R_base_flange` is (n, 3, 3)."""
         if self._is_identity:
             return wrench
         wrench = wrench @ self._matrix.T
@@ -424,14 +424,14 @@ class FrameTransform:
         return (wrench.reshape(-1, 2, 3) @ np.swapaxes(R_base_flange, 1, 2)).reshape(-1, 6)
 
     def matrix(self, R_base_flange: Array) -> Array:
-        """Return the matrix (6, 6) of the transform at one orientation (3, 3)."""
+        """Return the matrix (6, 6) of the transform at one flange orientation (3, 3)."""
         if not self._turns:
             return self._matrix
         return np.asarray((R_base_flange @ self._matrix.reshape(2, 3, 6)).reshape(6, 6))
 
 
 def frames_in_flange(frame: WrenchFrame, info: StreamInfo, R_base_flange: Array) -> dict[str, tuple[Array, Array]]:
-    """Return orientation and origin in the flange of sensor, tcp and the frame of a wrench, by `frame_id`.
+    """Return, by `frame_id`, orientation and origin in the flange of: sensor, tcp and the frame of a wrench.
 
     If the sensor height is unknown, the sensor is placed at the flange. For base axes the orientation of the wrench
     frame has the shape of `R_base_flange` (..., 3, 3).
@@ -478,7 +478,7 @@ def _require_tcp(info: StreamInfo) -> None:
 
 def quaternions(R: Array) -> Array:
     """Return unit quaternions x y z w (n, 4) of rotations (n, 3, 3)."""
-    # checking the matrices takes ten times as long
+    # checking that the matrices are rotations would take ten times as long
     return Rotation.from_matrix(R, assume_valid=True).as_quat()
 
 

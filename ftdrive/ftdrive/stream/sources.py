@@ -36,26 +36,26 @@ STALE_S = 0.3
 
 # Time between two attempts to reconnect, s.
 _RETRY_S = 0.2
-# The rates of the sensor and the arm are measured over this time after opening, s.
+# After opening, the rates of the sensor and the arm are measured over this time, s.
 _RATE_S = 0.5
 _RATE_WINDOW_NS = 1_000_000_000
 _ALONE = DeviceInfo("", "", "")
 STEP_S = 0.01
-"""Duration of the samples per read of a recording, s."""
-# Longest wait when reading a recording, s; it is short so that the reading thread reacts to keys.
+"""Duration, s, of the samples that one read of a recording returns, or one step while it is paused."""
+# Longest wait of one read of a recording, s; it is short so that the reading thread reacts to keys.
 _WAIT_S = 0.1
 
 
 class Read(NamedTuple):
-    """Result of one read of a source."""
+    """Result of one read of a sample source."""
 
     rows: Paired
     begin: Literal["", "interrupted", "elsewhere"] = ""
-    """Why the rows do not continue the previous rows: an interruption, or another position in a recording."""
+    """Why `rows` do not continue those read before: an interruption, or another position in a recording; or empty."""
     temperature_C: float | None = None
     """Sensor temperature; None if unknown."""
     delay_sigma_s: float = 0.0
-    """Standard deviation of the delay of the wrench after the pose."""
+    """Standard deviation of the delay of the sensor's samples after the arm's poses."""
 
 
 class SampleSource(ABC):
@@ -90,15 +90,15 @@ class SampleSource(ABC):
 
     @abstractmethod
     def read(self, timeout_s: float) -> Read:
-        """Return the next samples; none while a recording is paused. Raises `DeviceError`; the next call reconnects."""
+        """Return the next samples; none while a recording is paused. `DeviceError` if a device fails; then retry."""
 
     def links(self) -> Links:
-        """Return rates, losses and ages of the devices and the delay between them; the default is for a recording."""
+        """Return rates, losses and ages of the devices, and their delay; the base class gives those of a recording."""
         rate_Hz, arm_rate_Hz = self.info.sensor_rate_Hz, self.info.arm_rate_Hz
         return Links(LinkStatus(rate_Hz, rate_Hz, 0, 0.0), LinkStatus(arm_rate_Hz, arm_rate_Hz, 0, 0.0), 0.0, 0.0)
 
     def beginning(self) -> Iterable[Paired]:
-        """Return samples from which the noise is estimated beforehand; devices have none."""
+        """Return the samples, of a recording only, from which the noise is estimated before the first read."""
         return ()
 
 
@@ -143,10 +143,10 @@ class CellSource(SampleSource):
         """Duration of the samples per read, s; a block costs about the same with one sample as with many. May be set at
         any time: longer blocks arrive later and need less processor time."""
         self.payload_kg: float | None = None
-        """Payload in the controller; None if it is not reported."""
+        """Payload set in the controller; None if the controller does not report it."""
         self._arm: RobotArm | None = None
         self._stack, self._follows = ExitStack(), ExitStack()
-        # The failed device, "sensor" or "arm", and its error.
+        # The device that failed, "sensor" or "arm", and its error; None while both work.
         self._failure: tuple[str, DeviceError] | None = None
         self._silent_since_ns: int | None = None
         self._was_interrupted = False
@@ -186,7 +186,7 @@ class CellSource(SampleSource):
 
     @property
     def station(self) -> Station:
-        """The emulated cell; raises `ConfigError` for a real one."""
+        """The emulated cell, which can be controlled; raises `ConfigError` for a real cell."""
         if not isinstance(self._given, Station):
             raise ConfigError("only a stream with simulate=True has an emulated cell: this is a real cell")
         return self._given
@@ -396,7 +396,7 @@ class RecordingSource(SampleSource):
         self.info, self.rows, self.clock = info, rows, clock
         self._seconds = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
         self._speed = speed
-        # Index of the next row, whether the position has jumped, and the end of a single step.
+        # Index of the next row, whether the position has jumped since the last read, and end of a single step or -1.
         self._next, self._has_jumped, self._step_to_s = 0, False, -1.0
         self.is_paused = False
 
@@ -407,7 +407,7 @@ class RecordingSource(SampleSource):
 
     @property
     def at_s(self) -> float:
-        """Position in the recording of the newest row that was read."""
+        """Position in the recording, s from its start, of the newest row that was read."""
         return float(self._seconds[max(self._next - 1, 0)])
 
     @property
@@ -455,7 +455,7 @@ class RecordingSource(SampleSource):
     # -------------------------------------------------------------------------------------------------------- reading
 
     def read(self, timeout_s: float = _WAIT_S) -> Read:
-        """Return the rows that are due since the last read, after a short wait for them."""
+        """Wait shortly, and return the rows that playback has reached since the last read."""
         if self._step_to_s >= 0:
             end_s, self._step_to_s = self._step_to_s, -1.0
         elif self.is_paused or self.has_ended:
@@ -491,7 +491,7 @@ class RecordingSource(SampleSource):
 def _trusted(
     calibration: CalibrationResult, name: str, marks: tuple[str, ...]
 ) -> tuple[VerificationRecord | None, str]:
-    """Return the last verification of a calibration, and a text about its id, verdict, age and verification."""
+    """Return a calibration's last verification, and a text on the calibration's id, verdict, age and verification."""
     path = Path(name)
     verification = verification_near(path, calibration.id) if path.name and path.exists() else None
     state = age_and_check(calibration, verification, datetime.now(UTC))

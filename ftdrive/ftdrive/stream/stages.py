@@ -26,20 +26,20 @@ from ftdrive.stream.noise import REST, MotionTracker
 from ftdrive.stream.samples import FrameTransform, Paired, Stages, StreamInfo, WrenchFrame
 from ftdrivers.interfaces import Array
 
-# Temperature changes after which the bias is corrected, and after which an event is added, K.
+# Changes of the sensor's temperature after which its bias is corrected, and after which an event says so, K.
 _STEP_K, _NOTED_K = 0.05, 1.0
 _HOUR_NS = 3600e9
 LOWPASS_ORDER = 2
-"""Order of the Butterworth low-pass."""
+"""Order of the Butterworth low-pass filter."""
 NOTCH_Q = 10.0
-"""Centre frequency divided by the width at -3 dB."""
+"""Quality of the notch filter: its centre frequency divided by its width at -3 dB."""
 TARE_S = 0.5
 TARE_DRIFT_N, TARE_DRIFT_NM = 0.5, 0.015
-"""Standard deviation of the drift of the bias since the calibration or the last tare that a tare accepts."""
+"""Drift of the bias since the calibration or the last tare that a tare accepts as usual, one standard deviation."""
 
-# The acceleration comes from poses at this spacing over twice this reach: a longer reach blurs and delays moves.
+# The acceleration comes from poses at this spacing, s, up to this time before and after; a longer one blurs moves.
 _KNOT_S, _REACH_S = 0.002, 0.015
-# Largest motion of the flange during a tare.
+# Largest motion of the flange during a tare, rad and m.
 _STILL_RAD, _STILL_M = 5e-4, 5e-4
 
 
@@ -48,15 +48,15 @@ class Passing(NamedTuple):
 
     rows: Paired
     states: NDArray[np.int8]
-    """(n,) states of motion."""
+    """(n,) states of motion, as `MotionTracker.follow` returns them."""
     felt: Array
-    """(n, 6) inertial wrench from earlier poses only."""
+    """(n, 6) inertial wrench computed from earlier poses only."""
     inertial: Array | None
     """(n, 6) inertial wrench from the poses before and after each sample; None if it is not subtracted."""
     gravity: Array
-    """(n, 6) wrench of the weight."""
+    """(n, 6) wrench of the tool's weight."""
     bias: Array
-    """(6,) bias."""
+    """(6,) bias of the sensor, tares included."""
 
 
 class Stage(ABC):
@@ -65,12 +65,12 @@ class Stage(ABC):
     is_of_free_tool: ClassVar = False
     """Whether the stage subtracts the wrench of the free tool: contact is judged after the last of these stages."""
     power_gain = 1.0
-    """Factor on the noise variance of a sample, also for nonlinear stages."""
+    """Factor by which the stage multiplies the noise variance of a sample; a nonlinear stage has one, too."""
 
     @classmethod
     @abstractmethod
     def of(cls, settings: Stages, frame: WrenchFrame, info: StreamInfo) -> Self | None:
-        """Return the stage; None if it has nothing to do. Raises `ConfigError` if a setting is missing."""
+        """Create the stage; None if it has nothing to do. Raises `ConfigError` if it needs a missing setting."""
 
     @classmethod
     def words(cls, _settings: Stages) -> str:
@@ -79,7 +79,7 @@ class Stage(ABC):
 
     @abstractmethod
     def __call__(self, wrench: Array, passing: Passing) -> Array:
-        """Return the next wrenches (n, 6), N and N·m."""
+        """Apply the stage to the next samples; return their wrenches (n, 6), N and N·m."""
 
 
 class _FreeToolAtRest(Stage):
@@ -236,7 +236,7 @@ class _Deadband(Stage):
 
 
 STAGES: tuple[type[Stage], ...] = (_FreeToolAtRest, _InertialWrench, _Decoder, _Filter, FrameChange, _Deadband)
-"""All stages in order."""
+"""All stages in the order in which they are applied."""
 
 
 def stages_of(settings: Stages, frame: WrenchFrame, info: StreamInfo) -> tuple[Stage, ...]:
@@ -283,7 +283,7 @@ class Neighbours:
         """Discard the samples before an interruption."""
         self._buffer: Paired | None = None
         self._states, self._felt = np.zeros(0, np.int8), np.zeros((0, 6))
-        # Number of processed rows of the buffer.
+        # Number of rows of the buffer that `arrange` has already returned.
         self._done = 0
 
     @property
@@ -325,10 +325,10 @@ class Neighbours:
         return rows, state, felt, inertial
 
     def wrench(self, rows: Paired, load: Calibrated) -> tuple[Array, int]:
-        """Return the inertial wrench of all rows, and the number of those with neighbours on both sides."""
+        """Return the inertial wrench (n, 6) of all rows, and how many of the rows have neighbours on both sides."""
         knots = np.arange(0, len(rows), self._stride)
         t_s = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
-        # times of a coarse clock repeat
+        # a coarse clock gives several samples the same time
         knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]
         if len(knots) < 2 * self._reach + 2:
             return np.zeros((len(rows), 6)), 0
@@ -342,7 +342,7 @@ class Neighbours:
 class _Reference(NamedTuple):
     empty: Calibrated
     t_ns: int
-    # Sensor temperature at the time `t_ns`; NaN if unknown.
+    # Temperature of the sensor at the time `t_ns`; NaN if unknown.
     temperature_C: float
 
 
@@ -367,16 +367,16 @@ class FreeTool:
         self._references = [_Reference(self._calibration, 0, made_C)]
         self.held: Weight | None = None
         self.empty: Calibrated = self._calibration
-        """The newest reference at the current temperature."""
+        """The tool without a part, with the bias of the newest tare or calibration at the current temperature."""
         self.expected: Calibrated = self._calibration
-        """The empty tool plus the held part."""
+        """The tool of `empty` plus the held part."""
         self.load: Calibrated = self._calibration
         """The calibrated tool plus the held part: weight and inertia do not depend on the bias."""
         self._compensator: Compensator = self._calibration.compensator
         self._bias_change = np.zeros(6)
 
     def predict(self, rows: Paired) -> tuple[Array, Array]:
-        """Return the wrench (n, 6) of the weight and the bias (6,)."""
+        """Return the wrench (n, 6) of the weight of tool and part in the orientations of rows, and the bias (6,)."""
         gravity = rows.R_base_flange.reshape(-1, 9) @ self._compensator.matrix.T
         return gravity, np.asarray(self._compensator.offset + self._bias_change)
 
@@ -386,7 +386,7 @@ class FreeTool:
         return float(np.linalg.norm(self.expected.parameters.gravity_force_base_N)) / self._calibration.g_m_s2
 
     def motion_tracker(self) -> MotionTracker:
-        """Return a motion tracker for this load."""
+        """Return a new motion tracker for the tool with its held part."""
         return MotionTracker(self._rate_Hz, self.mass_kg, self.expected.parameters, self._p_flange_sensor_m)
 
     def hold(self, weight: Weight | None) -> None:
@@ -399,22 +399,22 @@ class FreeTool:
     def _with_part(self, empty: Calibrated) -> Calibrated:
         return empty if self.held is None else holding(empty, self.held, self._calibration.g_m_s2)
 
-    # The following methods change the bias, and return the change (6,).
+    # The following methods change the bias, and return by how much (6,).
 
     def set_tare(self, update: Update, t_ns: int) -> Array:
-        """Use the bias of a tare."""
+        """Use the bias of a new tare from now on; return the change (6,) of the bias."""
         return self._refer([*self._references, _Reference(update, t_ns, self._now_C)])
 
     def undo_tare(self) -> Array:
-        """Use the bias before the last tare again."""
+        """Use the bias before the last tare again; return the change (6,) of the bias."""
         return self._refer(self._references[:-1])
 
     def follow(self, update: Update, t_ns: int) -> Array:
-        """Use the bias of an update in place of all tares."""
+        """Use a tracked bias in place of all tares; return the change (6,) of the bias."""
         return self._refer([self._references[0], _Reference(update, t_ns, self._now_C)])
 
     def warm(self, temperature_C: float) -> Array:
-        """Use the bias at this temperature of the sensor."""
+        """Use the bias for this temperature of the sensor; return the change (6,) of the bias."""
         self._now_C = temperature_C
         return self._refer(self._references)
 
@@ -429,18 +429,18 @@ class FreeTool:
         return np.asarray(self._bias_change - before)
 
     def bias_growth(self, t_ns: int) -> Array:
-        """Return the variance (6,) of the change of the bias since calibration or tare, from earlier runs."""
+        """Return the variance (6,) that the bias has gained since calibration or tare, judged by earlier runs."""
         looked_ns = self._made_ns if self.tare_t_ns is None else self.tare_t_ns
         if self._hour_change is None or looked_ns is None:
             return np.zeros(6)
         return self._hour_change**2 * (max(t_ns - looked_ns, 0) / _HOUR_NS)
 
     def is_warmed_by(self, temperature_C: float) -> bool:
-        """Whether the bias must be corrected for this temperature of the sensor."""
+        """Return whether this sensor temperature differs enough from the last for a correction of the bias."""
         return self._temperature is not None and not abs(temperature_C - self._now_C) < _STEP_K
 
     def warming(self) -> tuple[str, Mapping[str, JSON]] | None:
-        """Return the text and values of a temperature event, if the change since the last one is large enough."""
+        """Return text and values of a temperature event if the change since the last event is large; else None."""
         if self._temperature is None or abs(self._now_C - self._noted_C) < _NOTED_K:
             return None
         self._noted_C = self._now_C
@@ -457,7 +457,7 @@ class FreeTool:
 
     @property
     def tare_t_ns(self) -> int | None:
-        """Time of the last tare."""
+        """Time of the last tare on the cell's clock, ns; None without a tare."""
         return self._references[-1].t_ns if len(self._references) > 1 else None
 
 

@@ -26,8 +26,8 @@ from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 
 RECOVER_S: Final = 10.0
-"""Default time-out, s: the loop ends after a longer interruption."""
-# Tolerated delay of a sink, s, because a busy computer can stop any sink for a moment.
+"""Default time-out, s, of an interruption: the loop that reads a stream ends after a longer one."""
+# A sink may be late by this much, s, before it misses samples, because a busy computer can stop any for a moment.
 _LATE_S: Final = 1.0
 
 
@@ -319,7 +319,7 @@ class Stream(Displayed):
 
 
 class Sink(ABC):
-    """A consumer of a stream, called by `pump` between two reads, in the reading thread."""
+    """A consumer of a stream, such as a recorder; `pump` calls it between two reads, in the reading thread."""
 
     label: ClassVar[str] = "output"
     """Name of the sink in messages."""
@@ -329,7 +329,7 @@ class Sink(ABC):
     """Number of samples that the sink did not receive because it was too slow."""
 
     def begin(self, stream: Stream) -> None:  # noqa: B027 - most have nothing to prepare
-        """Prepare for a stream, before its first block."""
+        """Prepare for a stream; called before its first block."""
 
     @abstractmethod
     def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
@@ -413,7 +413,7 @@ def pump(
 
 
 class _Outlets:
-    """The sinks of one loop, with the current delay of each, s."""
+    """The sinks of one `pump` loop, and by how much each is late, s."""
 
     def __init__(self, stream: Stream, sinks: list[Sink], say: Callable[[str], object]) -> None:
         self._stream, self._sinks, self._say = stream, sinks, say

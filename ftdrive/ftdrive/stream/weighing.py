@@ -33,13 +33,13 @@ PATIENCE_S = 10.0
 """Time-out of a zero or a single weighing, s."""
 # Time between two weighings, each over the last half second, s.
 _STEP_S = 0.1
-# The variance of a mean is estimated from n samples, and therefore increased by this factor over n.
+# Correction for few samples: the variance of a mean that is estimated from n samples is increased by this over n.
 _FEW: Final = 10.0
-# Largest age of the last window of a weighing in motion, s.
+# A weighing in motion fails if the newest window of tracking is older than this, s.
 _LATE_S: Final = 1.0
-# Poses that differ by more than this angle add information on the centre of mass.
+# A pose that differs from another by more than this angle, rad, adds information on the centre of mass.
 _NEW_POSE_RAD: Final = 0.17
-# Largest deviation from a whole number of parts.
+# Largest deviation of load / mass of one part from a whole number at which parts are counted.
 _WHOLE: Final = 0.1
 
 WORDS: Final[Mapping[str, str]] = {
@@ -59,7 +59,7 @@ _FAULTS: Final = *get_args(Fault), "count"
 
 
 class CannotWeigh(AcceptanceError):
-    """The reading does not correspond to one weight at rest.
+    """Raised when the reading cannot be weighed: it does not correspond to one weight at rest.
 
     `code` is a key of `WORDS`. `weight` is the weight fitted to a reading at rest in spite of the fault.
 
@@ -84,11 +84,11 @@ class Scale:
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
         self._readings: list[tuple[Array, Array, Array]] = []
-        # Smallest noise of a sample at rest, because a step of the load increases the estimate for a while.
+        # Smallest noise estimate at rest so far, because a step of the load increases the estimate for a while.
         self._quietest = np.full(6, np.inf)
 
     def weigh(self, since_ns: int = 0, *, more: bool = False) -> Weight:
-        """Weigh over the last half second, not before `since_ns` on the cell's clock; `more` adds earlier poses.
+        """Weigh over the last half second, all after `since_ns` on the cell's clock; `more` adds earlier poses.
 
         Earlier poses must have been taken with the same load. Raises `CannotWeigh` if the arm or the reading is not at
         rest, or the reading does not correspond to one weight.
@@ -282,7 +282,7 @@ def load_values(weight: Weight, info: StreamInfo) -> dict[str, JSON]:
 
 
 def count_of(weight: Weight, part_kg: float) -> int:
-    """Return the number of held parts of `part_kg`. Raises `CannotWeigh`."""
+    """Return how many parts of `part_kg` are held. Raises `CannotWeigh` if that is no whole number or uncertain."""
     parts = weight.mass_kg / part_kg
     whole = round(parts)
     sigma = float(np.hypot(weight.mass_sigma_kg, weight.scale_sigma * weight.mass_kg)) / part_kg
@@ -293,17 +293,17 @@ def count_of(weight: Weight, part_kg: float) -> int:
 
 @dataclass(frozen=True, slots=True)
 class ScaleState:
-    """The current state of the scale."""
+    """What the scale shows now: a weight, or why there is none."""
 
     weight: Weight | None
     refusal: str | None
-    """Key of `WORDS`; for faults such as "contact" there is a weight too."""
+    """Why the load is not weighed, as a key of `WORDS`, or None. With faults such as "contact" `weight` is set too."""
     count: int | None = None
     stale: str = ""
 
     @property
     def measured(self) -> Weight | None:
-        """The weight to show; None after a fault, unless only the number of parts could not be determined."""
+        """The weight to show; None if weighing failed. If only the count of parts failed, the weight is shown."""
         return self.weight if self.refusal in {None, "count"} else None
 
 
@@ -317,11 +317,11 @@ class Weighing(Sink):
     label, keeps_all = "scale", True
     shown = ScaleState(None, "samples")
     is_new = False
-    """Whether the last block gave a new weight or a lasting fault."""
+    """Whether a new weight, or a fault that lasts, was found with the last block."""
     note = ""
-    """Outcome of the last zero request."""
+    """Sentence on the last requested zero: waiting, done or refused."""
     refusal: NotAccepted | None = None
-    """Error of the last zero request, if it was refused."""
+    """Error that says why the last requested zero was refused; None if it was not."""
 
     def __init__(
         self,
@@ -337,7 +337,7 @@ class Weighing(Sink):
         # Weight of the current load; None if nothing has been weighed since the reading came to rest.
         self._last: Weight | None = None
         self._due_s = stream.clock.now_s() + _STEP_S
-        # Time of a zero request on the cell's clock; set by another thread.
+        # Time of a pending zero request on the cell's clock; None without one. Another thread sets it.
         self._zero_ns: int | None = None
         self._fault: str | None = None
         self._fault_since_s = 0.0
@@ -353,7 +353,7 @@ class Weighing(Sink):
         self._zero_ns = self.stream.clock.now_ns()
 
     def add(self, block: Block | None, _events: Sequence[StreamEvent]) -> None:
-        """Weigh or zero if it is due."""
+        """Weigh, or zero if requested, once per 0.1 s; during a device failure show why."""
         now_s, zero_ns, self.is_new = self.stream.clock.now_s(), self._zero_ns, False
         if block is None:
             self._last = None
@@ -361,7 +361,7 @@ class Weighing(Sink):
         elif now_s < self._due_s:
             return
         elif zero_ns is not None:
-            # an earlier weight would look current
+            # during a zero an earlier weight would look current
             self.shown = ScaleState(None, "samples")
             self._zero(zero_ns)
         else:
@@ -387,13 +387,13 @@ class Weighing(Sink):
             weight = weigh_in_motion(self.stream) if self.moving else self._scale.weigh(more=self.joins)
             return ScaleState(weight, None, None if self.part_kg is None else count_of(weight, self.part_kg))
         except CannotWeigh as refusal:
-            # the load may still be the same
+            # after these refusals the load may still be the same, so it is not weighed as a new one
             if refusal.code not in ("unsteady", "samples"):
                 self._last = None
             return ScaleState(refusal.weight, refusal.code)
 
     def _is_new(self, shown: ScaleState, now_s: float) -> bool:
-        """Pass a new weight, or a lasting fault once, to `keep`; return whether there was one."""
+        """Pass a new weight, or once a fault that lasts, to `keep`; return whether there was one of the two."""
         if shown.refusal != self._fault:
             self._fault, self._fault_since_s = shown.refusal, now_s
         if shown.refusal in _FAULTS and now_s - self._fault_since_s > WEIGH_S:
@@ -425,7 +425,7 @@ class Weighing(Sink):
 
 
 def format_scale(shown: ScaleState) -> str:
-    """Return the state as one line."""
+    """Return the state of the scale as one line for the screen."""
     if shown.stale:
         return f"stale: {shown.stale}"
     if shown.refusal is not None:
