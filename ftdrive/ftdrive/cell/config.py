@@ -272,7 +272,7 @@ class Setting:
     """A value of the configuration and its origin."""
 
     value: Any
-    """The value; None if it is not set and has no default."""
+    """The value; None if no source sets it and it has no default."""
     origin: str
     """The option, variable or file that sets it; "default" or "not set"."""
 
@@ -282,7 +282,7 @@ def without_password(text: str) -> str:
     return re.sub(r"(://[^:/@]*):.*@", r"\1@", text)
 
 
-# An option of a command and its value; None if the option was not given.
+# An option of a command, such as "--robot", and its value, which is None if the option was not given.
 Flag = tuple[str, Any]
 
 SECTIONS: Mapping[str, Any] = {
@@ -337,7 +337,7 @@ def settings(
     for key, (option, value) in (flags or {}).items():
         if value is not None:
             found[key] = Setting(check_value(option, key, value), option)
-    # A configured averaging time needs no noise record.
+    # If an averaging time is set, no noise is recorded to choose one.
     if "sampling.average_s" in found:
         found.setdefault("sampling.noise_record_s", Setting(0.0, found["sampling.average_s"].origin))
     defaults = {key: None if item.default is MISSING else item.default for key, item in _KEYS.items()}
@@ -476,12 +476,12 @@ def read_recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str
 
 
 def recorded_cell(config: Mapping[str, Mapping[str, Any]]) -> CellConfig:
-    """Return the cell of a run from the result of `read_recorded`."""
+    """Return the cell that a run recorded, from its sections as `read_recorded` returns them."""
     return CellConfig(**{name: kind(**config.get(name, {})) for name, kind in SECTIONS.items()}, clock=clock_in_force())
 
 
 def orientation_accuracy_deg(host: str | None, declared: float | None) -> float | None:
-    """Return the declared orientation accuracy, else that of nominal kinematics for an arm with a URDF, else None."""
+    """Return the declared accuracy; if None, that of nominal kinematics for an arm known by URDF only, or None."""
     nominal = NOMINAL_ORIENTATION_DEG if host is not None and "urdf=" in host else None
     return nominal if declared is None else declared
 
@@ -533,7 +533,7 @@ def document(
 
 
 def _entry(name: str, value: Any, comment: str, active: bool, width: int) -> Iterator[str]:
-    """Yield the lines of a value, with its comment after it if there is room, else above it."""
+    """Yield the lines of a value in a configuration file; its comment follows if there is room, or else precedes it."""
     text = f"{name} =" if value is None else f"{name} = {as_toml(value)}"
     line = f"{text if active and value is not None else f'# {text}':<32} # {comment}".removesuffix(" # ").rstrip()
     if len(line) <= width:

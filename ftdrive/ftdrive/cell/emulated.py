@@ -17,16 +17,16 @@ from ftdrivers import sensors
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError
 
-# Factor on the speed of the emulated arm, the only difference from a real cell.
+# An emulated cell runs this many times faster than real time, which is its only difference from a real cell.
 TIME_SCALE = 20
-# Options of a cell that is recorded in motion.
+# Options of an emulated cell that runs in real time, as a recording in motion needs.
 REAL_PACE = ("--time-scale", "1")
 _PERFECT = ("--gain", "0", "--cross-talk", "0")
 
 # Sensors of an emulated cell, for `Station(NAME)`, or with the address emulated://NAME for a sensor alone.
 SENSORS = {name: text for kind in sensors.SENSORS.values() for name, text in kind.emulated.items()}
 EMULATED = "emulated://"
-# Motion of the emulated arm in modes in which the session does not move it: request to the cell, and description.
+# By mode in which a session does not move the arm: the request that lets an emulated arm move, and its description.
 MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {
     "manual": ({"do": "hand-guide"}, "its arm is guided by hand to several orientations"),
     "passive": ({"do": "production"}, "a production program picks up, places and touches objects"),
@@ -58,7 +58,7 @@ class Station:
         self.values = dict(values)
         self.endpoints: Mapping[str, Any] = {}
         self.clock: Clock = REAL
-        """The clock of the cell, after its start."""
+        """Clock of the emulated cell once it has started; before that, the computer's clock."""
         self._process: subprocess.Popen[str] | None = None
 
     @classmethod
@@ -81,7 +81,7 @@ class Station:
         path = control_path or made_by.get("control_path", "auto")
         values = {key: check_value("the run", key, value) for key, value in made_by.get("values", {}).items()}
         own = tuple(made_by.get("options", ()))
-        # In earlier versions emulated sensors were perfect by default.
+        # Earlier versions emulated perfect sensors unless told otherwise, and runs of theirs must stay the same.
         if "truth" in made_by and not any(map(any, made_by["truth"].get("sensor_error", ()))):
             own = (*_PERFECT, *own)
         return cls(name, (*own, *options), control_path=path, values=values)
@@ -116,7 +116,7 @@ class Station:
 
     @property
     def truth(self) -> Mapping[str, Any]:
-        """True parameters of this cell."""
+        """True parameters of this emulated cell, which a calibration estimates."""
         truth: Mapping[str, Any] = self.endpoints["truth"]
         return truth
 
@@ -132,7 +132,7 @@ class Station:
         return self._process.pid if self._process else 0
 
     def control(self, **request: Any) -> Mapping[str, Any]:
-        """Send one request, such as `do="unplug", device="sensor"`, and return the answer."""
+        """Send the emulated cell one request, such as `do="unplug", device="sensor"`, and return its answer."""
         if self._process and self._process.stdin:
             self._process.stdin.write(json.dumps(request) + "\n")
             self._process.stdin.flush()
@@ -200,13 +200,13 @@ def _configured(sensor: str | None) -> Mapping[str, Any]:
 
 
 def _options(values: Mapping[str, Any], sensor: str) -> tuple[str, ...]:
-    """Return the options of a station with the masses, the sensor height and the mounting of a configuration."""
+    """Return options with which an emulated cell has the masses, sensor height and mounting of a configuration."""
     options = list[str]()
     if "tool.mass_kg" in values:
         options += ["--mass", str(values["tool.mass_kg"])]
     if "sensor.height_mm" in values:
         options += ["--sensor-origin", f"0,0,{values['sensor.height_mm'] / 1e3}"]
-    if "sensor.mass_kg" in values and sensor != "ur-ft":  # this sensor is part of the arm
+    if "sensor.mass_kg" in values and sensor != "ur-ft":  # the sensor "ur-ft" is part of the arm
         options += ["--sensor-mass-kg", str(values["sensor.mass_kg"])]
     mounting = values.get("workcell.mounting", "floor")
     if mounting in {"floor", "wall", "ceiling"}:
@@ -222,7 +222,7 @@ def _with_values(cell: CellConfig, values: Mapping[str, Any]) -> CellConfig:
 
 
 def sensor_reached(url: str, clock: Clock = REAL) -> tuple[str, Clock]:
-    """Return address and clock for a driver; emulated://NAME gives those of an emulated sensor, started once.
+    """Return address and clock for a driver; for emulated://NAME those of an emulated sensor, which is started once.
 
     The orientation of the sensor is constant; emulated:// alone is an ATI sensor on CAN. Any other address is returned
     unchanged with the given clock. Raises `ConfigError` for an unknown name.

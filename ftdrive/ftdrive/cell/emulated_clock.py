@@ -15,9 +15,9 @@ from ftdrivers.errors import ConnectError
 
 _VERSION: Final = 1
 _NOW, _COUNT, _SLOTS = 1, 2, 4
-# Period at which a waiting thread in `keeping_up` reads the clock, s.
+# Period at which a thread that waits inside `keeping_up` reads the clock, s.
 _SLICE_S: Final = 0.005
-# Time without progress of the clock after which the end of the station is checked, s.
+# If the clock stands still for this time, s, check whether the process of the emulated cell has ended.
 _SUSPECT_S: Final = 0.25
 _PATIENCE_S: Final = 30.0
 _LOCAL_SLOTS: Final = 8
@@ -58,15 +58,15 @@ class EmulatedClock(Clock):
         weakref.finalize(self, os.close, self._descriptor)
         self._own = threading.local()
         self._seen_ns, self._seen_at_s = 0, 0.0
-        # Offset to the computer's clock after the station has ended.
+        # Offset from the computer's clock, ns, once the process of the emulated cell has ended; None before.
         self._ended_ns: int | None = None
 
     def patience_s(self, limit_s: float) -> float:
-        """Return the larger of the limit and 30 s, because another process may get little CPU time."""
+        """Return a time limit for this clock: at least 30 s, as the emulating process may get little CPU time."""
         return max(limit_s, _PATIENCE_S)
 
     def now_ns(self) -> int:
-        """Return the time of the cell; let it advance if it waits for this thread and is not held."""
+        """Return the time of the emulated cell, and let it advance unless this thread is inside `held`."""
         now_ns = self._read_ns()
         if not getattr(self._own, "held", False):
             self._follow(now_ns)

@@ -9,16 +9,16 @@ from ftdrive.errors import ConfigError
 from ftdrivers.ur.control import CONTROL_SETTINGS
 
 Rows = tuple[tuple[float, ...], ...]
-# Returns the remedy for a value that cannot be used; None if the value can be used.
+# Function that returns the remedy for a value of a key that cannot be used, and None for one that can.
 Reject = Callable[[Any], str | None]
 
-# Smallest dimension; values in metres or inches are usually smaller.
+# Smallest dimension that is accepted in mm, because values given in metres or inches are usually smaller.
 _THINNEST_MM = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Meaning and allowed values of a key."""
+    """Meaning and allowed values of a configuration key."""
 
     help: str
     unit: str
@@ -29,7 +29,7 @@ class Rule:
 
     @property
     def range(self) -> str:
-        """The range with its unit, such as "0.5 to 60 deg/s"; the unit alone if there is no range."""
+        """The allowed range with its unit, such as "0.5 to 60 deg/s"; the unit alone if there is no range."""
         span = "" if self.between is None else "{:g} to {:g}".format(*self.between)
         return f"{span} {self.unit}".strip()
 
@@ -53,7 +53,7 @@ def entry(
 
 
 def rule_of(item: Field[Any]) -> Rule:
-    """Return the rule of a field."""
+    """Return the rule in the metadata of a configuration field."""
     rule: Rule = item.metadata["rule"]
     return rule
 
@@ -79,7 +79,7 @@ def ruled(where: str, item: Field[Any], value: Any) -> Any:
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is a finite number."""
+    """Return whether a value is a finite number; a bool does not count as one."""
     return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
 
 

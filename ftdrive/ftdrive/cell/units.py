@@ -58,7 +58,7 @@ def row(what: str, text: str, counts: Sequence[int]) -> list[float]:
 
 
 def rows_reader(*counts: int) -> Callable[[str, str], list[float]]:
-    """Return a function like `row` for rows with these numbers of lengths."""
+    """Return a function that parses a row as `row` does, with any of these counts of lengths."""
     return lambda what, text: row(what, text, counts)
 
 
@@ -112,5 +112,5 @@ def parse_numbers(option: str, text: str, separator: str, counts: Sequence[int])
 
 
 def rows(option: str, texts: Sequence[str], counts: Sequence[int]) -> list[list[float]] | None:
-    """Return the rows of a repeatable option, numbers separated by colons; None if it was not given."""
+    """Return the rows of a repeatable option, each of numbers separated by colons; None if it was not given."""
     return [parse_numbers(option, text, ":", counts) for text in texts] or None

@@ -21,15 +21,15 @@ from ftdrivers.errors import DeviceError, ModelUnknown
 from ftdrivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, RobotArm
 from ftdrivers.ur.kinematics import MODELS, kinematics_of
 
-# Distance by which the payload's centre of mass may lie outside the described tool.
+# Most by which the payload's centre of mass may lie outside the described tool, mm.
 _PAYLOAD_MM: Final = 100.0
 _LINK_S: Final = 0.5
 _CLOCK_S: Final = 1.0
 _LINK_TRIES: Final = 3
-# Number of random postures at which an arm is compared with its model.
+# Number of random postures at which the reported kinematics of an arm are compared with the nominal model.
 _POSTURES: Final = 200
 SLOWEST_SLIDER = 0.05
-"""Lowest speed slider for which the time-outs of moves are sufficient."""
+"""Lowest position of the speed slider, 0 to 1, at which the time-outs of moves are long enough."""
 # Rated payloads from the data sheets of Universal Robots. Later arms of a model may carry more: see the label.
 # The payload curve over the offset of the centre of mass is published only as a figure in the user manual.
 RATED_KG: Final = (
@@ -272,7 +272,7 @@ class FlangeLoad:
     """(3,) centre of mass, flange axes."""
     sigma_kg: float
     sigma_m: Array
-    """(3,) standard deviation of the centre of mass."""
+    """(3,) standard deviation of `p_flange_com_m`."""
 
 
 def flange_load(
@@ -312,7 +312,7 @@ def flange_load(
 
 
 def margin_in_words(mass_kg: float, model: str) -> str:
-    """Describe the margin between a mass and the rated payload of an arm."""
+    """Describe how far a mass is below the rated payload of an arm."""
     rated_kg = RATED_KG.get(model)
     if rated_kg is None:
         return f"{mass_kg:.2f} kg; the rated payload of a {model} is unknown: compare with its data sheet"

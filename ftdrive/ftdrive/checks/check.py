@@ -21,7 +21,7 @@ class Check:
     """Subject and property, such as "sensor.rate"."""
     state: State
     found: str
-    """The finding, with its values."""
+    """What the check found, with its values."""
     fix: str | None = None
     """The remedy: a command or an instruction; None if there is nothing to fix."""
 
@@ -56,9 +56,9 @@ class _Belonging:
     """Result of comparing a calibration with the connected devices, as sentences."""
 
     others: tuple[str, ...]
-    """Differences from the devices of the calibration."""
+    """Sentences about connected devices that differ from those of the calibration."""
     unknown: tuple[str, ...]
-    """Devices of the same model that cannot be compared, because a serial number is unknown."""
+    """Sentences about devices of the right model that were not compared further: a serial number is unknown."""
 
 
 def compare_devices(

@@ -44,7 +44,7 @@ class SensorAddress:
 
     @classmethod
     def of(cls, url: str) -> "SensorAddress":
-        """Return the parts of a sensor's address. Raises `BadUrl`."""
+        """Split a sensor's address into its parts. Raises `BadUrl` if it is not a valid address."""
         parts = split_url(url)
         return cls(parts.scheme, parts.address, dict(parse_qsl(parts.query)))
 
@@ -197,7 +197,7 @@ def _check_access(port: Path) -> Check:
 
 
 def _udev_command(tty: str) -> str:
-    """Return the command that assigns such ports to the group dialout, and adds the user to this group."""
+    """Return the command that gives serial ports of this kind to the group dialout, and adds the user to it."""
     rule = f'SUBSYSTEM=="tty", KERNEL=="{tty.rstrip("0123456789")}[0-9]*", GROUP="dialout", MODE="0660"'
     return (
         f"echo '{rule}' | sudo tee /etc/udev/rules.d/60-ftdrive.rules && sudo udevadm control --reload && "

@@ -48,13 +48,13 @@ class CellQuestion:
     """Key of the configuration, such as "robot.host"."""
     label: str
     how: str
-    """Form of the answer."""
+    """Form that the answer must have, such as its unit, as shown with the question."""
     read: Callable[[str, str], Any]
-    """Returns the value of an answer, or of one row; its arguments are the option, for messages, and the text."""
+    """Returns the value of an answer, or of one of its rows, from the option, which messages name, and the text."""
     usual: str | None = None
-    """Answer that Enter gives; "" leaves the key unset, None asks again."""
+    """Answer that Enter alone gives; "" leaves the key unset, and after None the question is asked again."""
     in_force: bool = False
-    """Whether Enter gives the value from the environment or the user's file."""
+    """Whether Enter alone gives the value that the environment or the user's file already sets."""
     repeats: bool = False
     choices: Sequence[str] = ()
 
@@ -65,7 +65,7 @@ class CellQuestion:
 
     @property
     def name(self) -> str:
-        """Name of the parameter of this option."""
+        """Name of the Python parameter that receives this option."""
         return self.option[2:].replace("-", "_")
 
 
@@ -121,9 +121,9 @@ class Description:
     def __init__(self, clock: Clock, in_force: Mapping[str, Any], *, simulate: bool = False) -> None:
         self.clock, self._in_force, self._simulate = clock, in_force, simulate
         self.texts: dict[str, list[str]] = {}
-        """Answers by key: one string, or one per row."""
+        """Answers by configuration key: a list with one string, or with one per row."""
         self.answered: set[str] = set()
-        """Keys whose question is answered."""
+        """Configuration keys whose question is answered."""
         self.reports: dict[str, str] = {}
         """What the devices report about themselves, by the key of their address."""
         self.places: list[str] = []
@@ -154,7 +154,7 @@ class Description:
         return question.usual
 
     def value(self, question: CellQuestion, text: str) -> Any:
-        """Return the value of an answer, or of one row; None for "unknown". Raises `ConfigError` if it is invalid."""
+        """Return the value of an answer or of one row, None for "unknown". Raises `ConfigError` if that is invalid."""
         if question.usual == "" and text.strip().lower() in ("", "none", "unknown"):
             return None
         if question.key == MODEL and ROBOT in self.reports:
@@ -221,7 +221,7 @@ class Description:
 
     @property
     def missing(self) -> list[CellQuestion]:
-        """Open questions without a default answer."""
+        """Questions that have neither an answer nor a default answer."""
         return [item for item in self.questions if not self.texts.get(item.key) and self.usual(item) is None]
 
     def cell(self) -> CellConfig:
@@ -243,11 +243,11 @@ class Description:
         return cell
 
     def found(self) -> dict[str, str]:
-        """Return the reports from the robot and the sensor, by role."""
+        """Return what the devices report about themselves, or that they are silent, by role: "robot" and "sensor"."""
         return {name: self.reports.get(key, _SILENT) for name, key in (("robot", ROBOT), ("sensor", SENSOR))}
 
     def file(self) -> str:
-        """Return the configuration file; raises the errors of `cell`."""
+        """Return the text of the configuration file; raises `ConfigError` as `cell` does."""
         return cell_file(self.cell(), [f"{name.capitalize()}: {words}." for name, words in self.found().items()])
 
     def save(self, draft: Path) -> None:

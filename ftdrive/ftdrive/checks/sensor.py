@@ -28,7 +28,7 @@ from ftdrivers.errors import (
 )
 from ftdrivers.interfaces import Array, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health, RobotArm
 
-# Makes a check from the name of a check and the error from a sensor's driver.
+# Function that returns the failed check of a given name for an error from a sensor's driver.
 Blame = Callable[[str, DeviceError], Check]
 
 _LOOK_S: Final = 2.0
@@ -40,10 +40,10 @@ _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs o
 _RATE_TOLERANCE = 0.1
 _MUCH_NOISE: Final = 2.0
 _LOAD: Final = 0.8
-# Share of the sensor's range at which a session stops the arm.
+# A session stops the arm if an axis of the sensor exceeds this fraction of its range.
 SATURATION: Final = 0.9
 _MUCH_AT_REST: Final = 0.5
-# A wrench at rest below this share of the weight is likely to be compensated or zeroed.
+# If the force at rest is below this fraction of the tool's weight, the wrench was probably compensated or zeroed.
 _COMPENSATED: Final = 0.1
 AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
@@ -164,7 +164,7 @@ def check_sensor_error(name: str, error: DeviceError, address: SensorAddress, pe
 
 
 def _not_reached(error: BaseException) -> bool:
-    """Return whether the device sent nothing; an error about an unexpected answer has no `__cause__`."""
+    """Return whether an error means that the device sent nothing; one about a wrong answer has no `__cause__`."""
     silent = isinstance(error, DeviceTimeout | StreamBroken)
     return silent or (isinstance(error, ConnectError) and error.__cause__ is not None)
 
@@ -185,7 +185,7 @@ def _who_answers(address: SensorAddress) -> str:
 
 
 def check_compensated(wrench: Array, cell: CellConfig) -> Check:
-    """Check that a topic's wrench (n, 6) at rest contains the weight of the tool or a bias, and is not near 0."""
+    """Check that a topic's wrench (n, 6) at rest is not near 0, as it is if weight and bias are already subtracted."""
     name, mass_kg = "sensor.compensated", cell.tool.mass_kg
     if mass_kg is None:
         return Check(name, "skipped", "[tool] mass_kg is not set, so compensation of the topic cannot be detected")
@@ -357,7 +357,7 @@ def examine_push(
     try:
         R_base_flange = None if arm is None else arm.state().R_base_flange
     except DeviceError:
-        R_base_flange = None  # the check robot.flange reports this
+        R_base_flange = None  # the check robot.flange reports that the pose is unknown
     try:
         before = sensor.collect(1.0).wrench[:, :3].mean(axis=0)
         with ExitStack() as stack:

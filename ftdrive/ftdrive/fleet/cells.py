@@ -88,7 +88,7 @@ class Owners:
         self._by_host = {cell.robot_host: cell.name for cell in cells if cell.robot_host and not cell.arm_serial}
 
     def cell_of(self, result: StoredResult | WeighingDay) -> str | None:
-        """Return the name of the cell; None if no cell has this arm."""
+        """Return the name of the cell to which a result or weighing day belongs; None if no cell has its arm."""
         by_serial = self._by_serial.get(result.arm_serial) if result.arm_serial else None
         return by_serial or (self._by_host.get(result.robot_host) if result.robot_host else None)
 
@@ -126,14 +126,14 @@ def _parse_cell(path: Path, name: str, table: Any) -> StoredCell:
     )
 
 
-# Age of the oldest verification that is read. A drift of the bias appears within weeks; reading all verifications would
-# take four times as long after a year and detect no drift earlier.
+# Verifications older than this are not read. A drift of the bias appears within weeks; after a year, reading all would
+# take four times as long and would detect no drift earlier.
 WINDOW: Final = timedelta(days=90)
-# Number of the newest results of each tool that are read, so that the time does not grow with the age of the fleet.
+# Of each tool this many of the newest results are read, so that reading takes no longer as the fleet ages.
 NEWEST: Final = 3
 
 
-# One row per verification: days since the calibration, and change of the bias, force first, N and N·m.
+# Array of one record per verification: days since the calibration, change of the bias (N and N·m), temperature, sigmas.
 Changes = NDArray[np.void]
 _COLUMNS: Final = np.dtype(
     [
@@ -148,22 +148,22 @@ _COLUMNS: Final = np.dtype(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Results, verifications and weighings of a fleet."""
+    """Results, verifications and weighings of a fleet, as read from its store at one time."""
 
     cells: tuple[StoredCell, ...]
     results: Mapping[str, Sequence[StoredResult]]
-    """The newest accepted results of each tool, by cell, the oldest first."""
+    """The newest accepted results of each tool, by name of the cell, oldest first."""
     checks: Mapping[str, Sequence[VerificationRecord]]
-    """Verifications by calibration, the oldest first, of the last `WINDOW`."""
+    """Verifications of the last `WINDOW` by id of their calibration, oldest first."""
     changes: Mapping[str, Changes]
-    """Changes of the bias by calibration, if its verifications have estimated any."""
+    """Changes of the bias by id of the calibration, if verifications of it have estimated any."""
     weighings: Mapping[tuple[str | None, str | None, bool], WeighingDay]
     """The last weighing day by cell, tool, and whether the cell was emulated."""
     now: datetime
 
     @classmethod
     def read(cls, store: Store, now: datetime) -> Self:
-        """Return the contents of a store; raises `BadStore`."""
+        """Read what a store contains about the fleet; raises `BadStore` if it cannot be read."""
         cells, newest, recent, weighings = store.fleet(NEWEST, now - WINDOW)
         owners = Owners(cells)
         results: dict[str, list[StoredResult]] = {cell.name: [] for cell in cells}
@@ -194,7 +194,7 @@ class Observed:
 
 
 def _bias_changes(result: StoredResult, checks: Sequence[VerificationRecord]) -> Changes | None:
-    """Return the changes of the bias since a calibration; None if no verification has estimated any."""
+    """Return the changes of the bias since a calibration by verification; None if none has estimated any."""
     start = when(result)
     rows = [
         ((when(check) - start).total_seconds() / 86400, check.temperature_C, *change, *sigma, *common)
@@ -208,5 +208,5 @@ def _bias_changes(result: StoredResult, checks: Sequence[VerificationRecord]) ->
 
 
 def when(record: StoredResult | VerificationRecord) -> datetime:
-    """Return the time of a record, which must have one."""
+    """Return the time at which a result or a verification was made; the record must contain it."""
     return datetime.fromisoformat(str(record.created_utc))

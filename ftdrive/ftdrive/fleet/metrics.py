@@ -25,11 +25,11 @@ def _seconds(time: datetime | str | None) -> float | None:
 
 
 def _labels(*texts: str | None) -> list[str]:
-    """Return label values without control characters, which may come from files and devices."""
+    """Return texts as label values, without the control characters that files and devices may have put into them."""
     return [visible(text or "") for text in texts]
 
 
-# Metrics with the labels `TOOL`: help text, and function that returns the value; None is left out.
+# Metrics of a tool, with the labels `TOOL`: help text, and function that returns the value, or None to leave it out.
 OF_TOOL: Final[Mapping[str, tuple[str, Callable[[CellState], float | None]]]] = {
     "ftdrive_calibration_timestamp_seconds": (
         "When the newest accepted calibration was made.",
@@ -78,7 +78,7 @@ REFUSALS: Final = "ftdrive_weighings_refused_total"
 FINDING: Final = "ftdrive_finding"
 STORE_UP: Final = "ftdrive_store_up"
 STATE_TIME: Final = "ftdrive_state_timestamp_seconds"
-# All metrics.
+# Names of all metrics that the server exports.
 NAMES: Final = (*OF_TOOL, WEIGHINGS, REFUSALS, CELL_INFO, FINDING, STORE_UP, STATE_TIME)
 
 
@@ -108,7 +108,7 @@ class MetricsServer(Collector):
         self.port = self._gate.port
 
     def update(self, fleet: Fleet, read: datetime, store_up: bool) -> None:
-        """Serve this state, which was read at time `read`, UTC."""
+        """Serve this state of the fleet from now on; it was read from the store at time `read`, UTC."""
         self._newest = fleet, read, store_up
 
     def _answer(self, request: dict[str, Any], start: Any) -> Any:

@@ -10,7 +10,7 @@ from ftdrive.fleet.state import Fleet, attention, summary, times_in_words
 from ftdrive.report.page import templates, with_code
 
 WIDTH, HEIGHT, MARGIN = 220, 44, 3
-# Smallest range of a plot, in sigmas to each side.
+# A plot of the bias shows at least this range, in sigmas to each side of zero.
 LEAST_SIGMAS = 4.0
 
 

@@ -39,12 +39,12 @@ from ftdrive.runs.run import IN_MOTION, Run
 from ftdrive.runs.source import circumstances_of, solve_in_motion
 
 CHANGED_SIGMAS: Final = 3.0
-# Files of a run that are needed to solve it.
+# Patterns of the files of a run that are needed to solve it.
 _FILES: Final = ("run.json", "events.ndjson", "dataset*.json", "calibration*.json", "motion*.npz", "motion/*.npz")
 
 
 def solved_path(folder: Path) -> Path:
-    """Return the path of the result of this version in a run folder."""
+    """Return the path in a run folder where the result of this version of ftdrive is saved."""
     return folder / f"solved-{__version__}.json"
 
 
@@ -59,7 +59,7 @@ def is_calibration(folder: Path, since: datetime | None) -> bool:
 
 
 def runs_to_solve(folders: Iterable[Path], since: datetime | None, say: Callable[[str], object]) -> list[Path]:
-    """Return the calibrations among runs; `say` receives how many have no data yet, and how to finish them."""
+    """Return those runs that are calibrations with data; `say` receives how many have none, and how to finish them."""
     runs, unfinished = list[Path](), Counter[str]()
     for run in folders:
         if is_calibration(run, since):
@@ -111,17 +111,17 @@ def _solve_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Comparison of the result of this version with the calibration of the run."""
+    """Comparison of the result that this version solved with the calibration that the run has."""
 
     verdict_before: str | None
     """Verdict of the calibration of the run; None if none was saved, because it was rejected or not observable."""
     verdict: str
     finding: Finding | None
-    """First finding of the new result; None if its verdict is good."""
+    """First finding that this version reports on the result; None if its verdict is good."""
     parameter: str
-    """Parameter of `ftcalib.model.PARAMETER_NAMES` with the largest change."""
+    """Parameter with the largest change between the results, of `ftcalib.model.PARAMETER_NAMES`."""
     sigmas: float
-    """Change of this parameter in sigmas of both results; infinite for a value that both results take as known."""
+    """Change of `parameter`, in sigmas of both results; infinite if both results take this parameter as known."""
 
     @property
     def has_changed(self) -> bool:
@@ -179,7 +179,7 @@ def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
 
 
 def _data_hash(result: CalibrationResult) -> object:
-    """Return the hash of the poses, or of the recording in motion, of a result."""
+    """Return the hash of the data from which a result was solved: its poses, or its recording in motion."""
     return result.provenance.get("dataset_sha256") or result.provenance.get("recording_sha256")
 
 
@@ -195,7 +195,7 @@ class SolvedAgain:
     failed: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, run: Path, outcome: Comparison | str) -> None:
-        """Add an outcome of `solve_again`."""
+        """Count an outcome that `solve_again` yielded."""
         here = {"run": str(run)}
         if isinstance(outcome, str):
             self.failed.append({**here, "reason": outcome})

@@ -40,12 +40,12 @@ class CellState:
     """Id of the newest accepted calibration."""
     verdict: str | None = None
     calibrated: datetime | None = None
-    """Time of this calibration, UTC."""
+    """Time at which this newest calibration was made, UTC."""
     verified: datetime | None = None
     """Time of the last verification of this calibration, UTC."""
     passed: bool | None = None
     change: str | None = None
-    """Change that the last verification found, such as "bias"."""
+    """What has changed since the calibration, as the last verification found, such as "bias"; None if nothing."""
     due: datetime | None = None
     """Time at which the next verification is due, UTC; None for a tool without a calibration, which is due now."""
     mass_kg: float | None = None
@@ -84,12 +84,12 @@ FindingKind = Literal["payload", "temperature", "base", "overdue", "weighing"]
 
 @dataclass(frozen=True, slots=True)
 class FleetFinding:
-    """A finding from several results together."""
+    """A finding that needs the results of several calibrations or cells together."""
 
     kind: FindingKind
     cells: tuple[str, ...]
     words: str
-    """The finding with its values, and the remedy."""
+    """A sentence with the finding, its values, and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +179,7 @@ def attention(fleet: Fleet, now: datetime) -> list[str]:
     return sentences + [state.words for state in fleet.findings]
 
 
-# Time between two readings of the store, s.
+# Time between two readings of the fleet's store by the server, s.
 EVERY_S: Final = 60.0
 
 

@@ -98,20 +98,20 @@ SIGMAS: Final = 4.0
 # Centres of mass of one tool agree within the first distance, and that of a payload is wrong beyond the second.
 # A limit smaller than 4 sigma is replaced by 4 sigma.
 ALIKE_M, WRONG_M = 0.003, 0.005
-# The corresponding limits of the masses; a mass is wrong beyond the larger of `WRONG_SHARE` and `WRONG_KG`.
+# The same limits for masses, as fractions of the mass; one is wrong beyond the larger of `WRONG_SHARE` and `WRONG_KG`.
 ALIKE_SHARE, WRONG_SHARE, WRONG_KG = 0.03, 0.1, 0.1
-# Largest mass of the sensor and its adapter, which the payload includes but the identified mass does not.
+# Assumed upper bound on the mass of sensor and adapter, which the payload includes but the identified mass does not.
 MOST_SENSOR_KG: Final = 1.0
 TILTED_RAD: Final = np.deg2rad(0.1)
 # Added to the sigma of a tilt, because the arm bends differently in each posture.
 TILT_FLOOR_RAD: Final = np.deg2rad(0.02)
 # Significance level for a turned base: a false finding in one of 50 fleets of 200 cells.
 SURE: Final = 1e-4
-# Tolerance after the due time of a verification.
+# A verification counts as late this long after it was due.
 LATE: Final = timedelta(days=1)
-# Smallest number of weighings per day for a finding about refusals.
+# A finding about refused weighings needs at least this many weighings in a day.
 MANY_WEIGHINGS: Final = 10
-# Age of the oldest refusals that are reported.
+# Refused weighings older than this are not reported.
 RECENT: Final = timedelta(days=3)
 
 
@@ -186,7 +186,7 @@ def _bases(observed: Observed) -> Iterator[FleetFinding]:
 
 
 def _turned(before: StoredResult, after: StoredResult) -> tuple[float, float]:
-    """Return the angle between the gravity directions of two results, rad, and its p-value for a fixed base."""
+    """Return the angle between the gravity directions of two results, rad, and its p-value if the base is fixed."""
     weights = [result.parameters.weight_N for result in (before, after)]
     if not min(weights) > 0:
         return 0.0, 1.0

@@ -37,9 +37,9 @@ _SHORT_LOG: Final = {"distributed.admin.low-level-log-length": 10}
 _LARGE_CALLS: Final = {"distributed.admin.large-graph-warning-threshold": "1TB"}
 _DIED: Final = "every worker that solved this run died: run `ftdrive solve` on it to see the cause"
 
-# Return value or exception of a call.
+# Return value of a call that a worker made, or the exception that the call raised.
 Answer = bytes | BaseException
-# A function and its arguments.
+# A call that a worker is to make: a function and its arguments.
 Call = tuple[Callable[..., bytes], *tuple[Any, ...]]
 
 
@@ -71,20 +71,20 @@ def folder_of_worker() -> str | None:
 
 
 def describe_error(error: BaseException) -> str:
-    """Describe the error of a call."""
+    """Describe, as one sentence, the exception that a worker's call raised."""
     expected = isinstance(error, FtdriveError | OSError)
     return str(error) if expected else f"unexpected {type(error).__name__}: {error}"
 
 
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """Workers that run several calls at a time."""
+    """Worker processes, of this computer or a Dask cluster, that run several calls at a time."""
 
     count: int
     submit: Callable[..., "Future[bytes]"]
-    """Starts a call; its arguments are a function and the arguments of the function."""
+    """Starts a call on a worker and returns its future; takes a function and the arguments of the function."""
     death: type[Exception]
-    """Exception of a future whose worker has died."""
+    """Type of the exception that a future raises if its worker has died."""
     share_files: bool = False
     """Whether all workers have the same file system."""
     require_one: Callable[[], None] = lambda: None

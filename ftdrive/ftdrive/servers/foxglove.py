@@ -50,7 +50,7 @@ from foxglove.channels import LogChannel, SceneUpdateChannel
 from foxglove.websocket import Capability, Client, ServerListener, StatusLevel
 
 FORCE_M_N, TORQUE_M_NM = 0.01, 0.1
-"""Lengths of the arrows per N and per N·m: 10 N and 1 N·m are 100 mm."""
+"""Lengths of the drawn arrows, m per N and m per N·m: 10 N and 1 N·m are 100 mm."""
 _ORANGE, _BLUE = messages.Color(r=1.0, g=0.5, b=0.0, a=1.0), messages.Color(r=0.1, g=0.4, b=1.0, a=1.0)
 _HEAD_M = 0.02
 
@@ -99,10 +99,10 @@ VIEWERS: Final = (
     # the container of Lichtblick
     "http://localhost:8080",
 )
-"""Origins of the pages of Foxglove and Lichtblick."""
+"""HTTP origins of the web pages and desktop programs of Foxglove and Lichtblick."""
 
 SCENE_HZ = 60.0
-"""Rate of frames and arrows, Hz: no screen shows more."""
+"""Rate, Hz, at which coordinate frames and arrows are sent: no screen shows more."""
 STATUS_HZ = 2.0
 BACKLOG = 1 << 15
 """Number of messages queued per slow client, two seconds at 7 kHz; then the oldest are dropped."""

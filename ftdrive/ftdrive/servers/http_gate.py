@@ -26,7 +26,7 @@ from ftdrive.errors import ConfigError
 
 Address = tuple[str, int]
 
-# Time-out of a request's head, s.
+# Time-out for the head of an HTTP request, s.
 _HEAD_S: Final = 10.0
 _HEAD_BYTES: Final = 1 << 14
 _PIECE: Final = 1 << 16
@@ -101,14 +101,14 @@ class Request:
     async def answer(
         self, status: HTTPStatus, body: bytes = b"", content: str = "text/plain; charset=utf-8", *more: str
     ) -> None:
-        """Send a complete answer; `more` are header lines."""
+        """Send a complete HTTP answer; `more` are additional header lines."""
         head = [f"HTTP/1.1 {status} {status.phrase}", f"Content-Type: {content}", *more]
         head += [f"Content-Length: {len(body)}", "X-Content-Type-Options: nosniff", "Connection: close"]
         self.writer.write("\r\n".join([*head, "", ""]).encode() + (b"" if self.method == "HEAD" else body))
         await self.writer.drain()
 
     async def refuse(self, status: HTTPStatus, why: str) -> None:
-        """Answer with a status and one sentence."""
+        """Answer the request with an HTTP error status and one sentence."""
         await self.answer(status, f"{why}\n".encode())
 
 

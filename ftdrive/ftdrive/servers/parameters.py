@@ -20,7 +20,7 @@ _FRAME: Final = {
     "about": "Reference point of the torque of ~/wrench: sensor, flange, tcp, or [x, y, z] in m from the flange.",
 }
 STAGE_TEXTS: Final[Mapping[str, str]] = {item.name: item.metadata["text"] for item in fields(Stages)}
-"""Description of each setting of the stages."""
+"""Description of each setting of `Stages`, by name."""
 _KINDS: Final[dict[str, type]] = {item.name: type(item.default) for item in fields(Stages)}
 _EXPECTED: Final = {
     "axes": f"set one of {', '.join(get_args(Axes))}",
@@ -34,7 +34,7 @@ _EXPECTED: Final = {
 
 
 def checked_value(name: str, value: Any) -> JSON:
-    """Return the value in the type that `WrenchFrame` or `Stages` requires. Raises `ConfigError`."""
+    """Return a parameter's value in the type that `WrenchFrame` or `Stages` requires; `ConfigError` if invalid."""
     kind = _KINDS.get(name)
     named = {"axes": get_args(Axes), "about": get_args(Point)}.get(name, ())
     if value in named or (kind is bool and isinstance(value, bool)):
@@ -53,7 +53,7 @@ def parameters_of(frame: WrenchFrame, stages: Stages) -> dict[str, JSON]:
 
 
 def with_changes(frame: WrenchFrame, stages: Stages, changes: Iterable[tuple[str, Any]]) -> tuple[WrenchFrame, Stages]:
-    """Return the frame and the stages with changed parameters. Raises `ConfigError`."""
+    """Return the frame and the stages with changed parameters. Raises `ConfigError` if a value is invalid."""
     of_frame, of_stages = asdict(frame), asdict(stages)
     for name, value in changes:
         (of_frame if name in of_frame else of_stages)[name] = checked_value(name, value)
@@ -123,7 +123,7 @@ class NodeParameters:
 
     def __init__(self, node: Any, frame: WrenchFrame, tool: str) -> None:
         self.apply: Callable[[WrenchFrame, Stages, str], None] = lambda *_: None
-        """Applies the frame, stages and tool, or raises `ConfigError`."""
+        """Called with the new frame, stages and tool to apply them; raises `ConfigError` to reject them."""
         defaults = parameters_of(frame, Stages()) | {"tool": tool} | asdict(Fixed())
         messages = ros2_module("rcl_interfaces.msg")
         given = {}

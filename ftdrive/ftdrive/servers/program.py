@@ -27,29 +27,29 @@ DOUBLES: Final = (
     *("mass", "mass_sigma", "least_mass"),
     *("com_x", "com_y", "com_z", "com_sigma_x", "com_sigma_y", "com_sigma_z"),
 )
-"""Contents of the input registers of each kind, starting at the first register."""
+"""Values that the service writes to double registers of the controller, from the first register on."""
 TRACKED: Final = ("bias_fx", "bias_fy", "bias_fz", "bias_tx", "bias_ty", "bias_tz", "bias_age")
-"""Further double registers if bias and part are tracked. If `tracking` is 0, the service does not write them."""
+"""Values written after `DOUBLES` if bias and part are tracked. If `tracking` is 0, they are not written."""
 
 STALE_S: Final = 0.05
 """The wrench is stale after this time without a sample, s."""
 PATIENCE_S: Final = 1.0
-"""A request is refused after waiting this long for rest, s; a weighing at rest takes `WEIGH_S`."""
+"""A request is refused if the arm does not come to rest in this time, s; a weighing at rest takes `WEIGH_S`."""
 _TRY_NS: Final = 20_000_000
 _WAITS: Final = ("samples", "moving", "unsteady")
-# Largest angle between force and gravity at which a contact is taken for an unknown load.
+# A contact whose force is within this angle, rad, of gravity, up or down, is taken for an unknown load.
 _ALIKE_RAD: Final = 0.1
 _COUNT_LIMIT: Final = 2**30
 
 
 class ServiceCommand(IntEnum):
-    """Request of a program."""
+    """Request that a program on the controller can make."""
 
     WEIGH, ZERO, STATUS = 1, 2, 3
 
 
 class ServiceState(IntEnum):
-    """State of the service, or of the last request while `number` is its number."""
+    """State of the service; while `number` is the number of the last request, the state of that request."""
 
     STOPPED, READY, BUSY, REFUSED = range(4)
 
@@ -66,12 +66,12 @@ CODES: Final = {"": 0} | {reason: number for number, reason in enumerate(_REASON
 
 
 def doubles_of(track: Tracking) -> tuple[str, ...]:
-    """Return the contents of the double registers."""
+    """Return the names of the values in the double registers, depending on whether bias and part are tracked."""
     return DOUBLES if track == "off" else DOUBLES + TRACKED
 
 
 class ProgramService(Sink):
-    """Answers the requests of one program.
+    """Answers the requests of one program on the controller, and writes the contact wrench to its registers.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class ProgramService(Sink):
         self._scale = Scale(stream)
         self._lock = threading.Lock()
         self._live = 0
-        # Number of the last request; None until the first one is read, which may belong to an earlier program.
+        # Number of the last request. None until a first one is read, which is ignored: it may be an earlier program's.
         self._number: int | None = None
         self._command, self._since_ns, self._due_ns = 0, 0, 0
         self._state, self._code, self._condition = ServiceState.READY, 0, Condition.FREE
@@ -189,7 +189,7 @@ class ProgramService(Sink):
             self._registers = None
 
     def _tracked(self) -> list[float]:
-        """Return the tracked change of the bias since the calibration, and the age of its last observation or -1."""
+        """Return tracked change of the bias since calibration, and age, s, of its last observation (-1: none)."""
         tracked = self._stream.processor.monitor.tracked
         if tracked is None or not np.isfinite(tracked.last_seen_s):
             return [*[0.0] * 6, -1.0]
@@ -209,7 +209,7 @@ class ProgramService(Sink):
         try:
             request = None if self._registers is None else self._registers.request
         except DeviceError:
-            # the next write reports the lost connection
+            # the next write to the registers reports the lost connection
             request = None
         if request is not None and self._number is None:
             self._number = request[0]

@@ -57,7 +57,7 @@ class TransformPublisher:
         self._moving = node.create_publisher(message, "/tf", 100)
 
     def named(self, frame_id: str) -> str:
-        """Return the name of a frame with the parameters' names for axes and point."""
+        """Return a frame's id with the names that the node's parameters give to sensor, flange and base."""
         return "_at_".join(self._names.get(part, part) for part in frame_id.split("_at_"))
 
     def use(self, info: StreamInfo) -> None:
@@ -67,7 +67,7 @@ class TransformPublisher:
             self._send(self._static, fixed, self._node.get_clock().now().nanoseconds)
 
     def publish(self, block: Block, info: StreamInfo, t_ns: int) -> None:
-        """Publish the moving frames at the time of the newest sample of a block."""
+        """Publish the frames that move, as they are at the newest sample of a block."""
         if not self._picked.rows(np.array([t_ns])).any():
             return
         p_m = block.p_base_flange_m[-1]
@@ -84,14 +84,14 @@ class TransformPublisher:
 
 
 class Averaged:
-    """Means over the number of consecutive samples that gives at most `rate_Hz`; a single sample is not changed.
+    """Averages consecutive samples, so many that the means come at no more than `rate_Hz`; one alone is not changed.
 
     If samples are lost, the mean is over the others. Samples of an interval cut by an interruption are dropped,
     because their mean would be late.
     """
 
     def __init__(self, sensor_rate_Hz: float, rate_Hz: float) -> None:
-        # the rate is known to about 0.3 %
+        # 1 % less than the quotient, because the sensor's rate is known to about 0.3 % only
         self.count = max(1, int(np.ceil(0.99 * sensor_rate_Hz / rate_Hz)))
         """Number of samples per mean."""
         self._longest_ns = 2e9 * self.count / sensor_rate_Hz
@@ -102,7 +102,7 @@ class Averaged:
         self._waiting = None
 
     def add(self, block: Block) -> Block:
-        """Return the means completed by this block; other columns come from the first sample of each."""
+        """Return the means that this block completes; columns other than wrenches are those of their first samples."""
         waiting, self._waiting = self._waiting, None
         if waiting is not None and self._continues(waiting, block):
             block = Block.concatenate([waiting, block])
@@ -158,7 +158,7 @@ class PartState:
 
 
 def reports_of(stream: Stream, lost_before: int, sent: int) -> list[PartState]:
-    """Return the states of an open stream; `lost_before` is the number of lost samples at the previous report."""
+    """Return the state of each part of a stream's node; `lost_before` is the count of lost samples a report earlier."""
     status, info = stream.status(), stream.info
     verdict, stages = info.calibration.verdict, stages_in_words(stream.stages)
     values = {
@@ -199,15 +199,15 @@ def _link_state(part: str, link: LinkStatus, device: Any, lost: int) -> PartStat
 
 NAME: Final = "ftdrive"
 REPORT_S: Final = 0.4
-"""Time between two reports, s; a fault is reported at once."""
+"""Time between two reports of the node's state, s; a fault is reported at once."""
 # Samples are processed in blocks of this duration, s, which is the maximum delay of a message.
 _BLOCK_S: Final = 0.008
 _CONTACT_S: Final = 0.1
-# Time until the other nodes of this computer and network are discovered, s.
+# Waiting time, s, in which the ROS nodes of this computer and network are discovered.
 _DISCOVERY_S: Final = 1.0
-# Waiting time after a device failed to open, s.
+# Waiting time before a device that failed to open is tried again, s.
 _RETRY_S: Final = 2.0
-# Waiting time if the calibration does not fit the devices, s: the operator must calibrate or select another tool.
+# The same, s, if the calibration does not fit the devices: the operator must calibrate or select another tool.
 _RETRY_CONFIG_S: Final = 10.0
 # History of a reliable topic, s, because Fast DDS requests lost messages every 3 s.
 _HISTORY_S: Final = 10.0
@@ -408,7 +408,7 @@ class Ros2Node(Sink):
         return response
 
     def _apply(self, frame: WrenchFrame, stages: Stages, tool: str) -> None:
-        """Apply parameters in the node's thread. Raises `ConfigError` and then changes none."""
+        """Apply new parameters in the node's thread. If one cannot be used, raise `ConfigError` and change none."""
         if self._stream is not None:
             set_stream(self._stream, frame, stages, partial(self._request_tool, tool))
 

@@ -221,7 +221,7 @@ class DelayEstimator:
         return True
 
     def _linearised(self, t_s: Array, force: Array, R: Array, p: Array) -> tuple[Array, Array] | None:
-        """Return Jacobian and residual of the force of a free tool; None while the tool does not turn."""
+        """Return Jacobian and residual of a free tool's force for the fit of the delay; None if it does not turn."""
         parameters, compensator = self._calibration.parameters, self._calibration.compensator
         motion = self._load.motion(t_s, R, p)
         W = skew(motion.angular_velocity_rad_s)
