@@ -133,7 +133,7 @@ def read_recording(
     columns : collection of str
         Required fields of `Recording.rows`. Others may be left out, which makes reading faster.
     calibration : CalibrationResult, optional
-        Calibration for a recording of another program, which has none; `raw` is the measured wrench, `wrench` is 0.
+        Calibration to store with another program's recording. It is not applied: rows have `raw`, and 0 as `wrench`.
     table : TableOptions, optional
         What the table itself does not contain.
 
@@ -427,7 +427,7 @@ def _float_rows(rows: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...
     return tuple(tuple(map(float, row)) for row in rows)
 
 
-# Smallest reading, as a share of the known load, that is taken for the load.
+# A reading of at least this fraction of the known load's mass means that the load hangs from the tool.
 _SHOWS = 0.5
 
 
@@ -508,7 +508,7 @@ def _run_of(path: Path) -> tuple[LoadRun, dict[str, Any], RecordedData]:
 def _prior_matrix(
     data: RecordedData, identity: dict[str, Any], names: list[str], say: Callable[[str], object]
 ) -> SensorMatrix:
-    """Return the prior matrix of the sensor: from earlier loads, its data sheet, or typical errors."""
+    """Return the sensor matrix before the fit, as prior: from earlier loads, the data sheet, or typical errors."""
     for path in reversed(sensor_files()):
         known = SensorMatrix.load(path)
         if not identity_mismatch(known, identity) and not {*known.provenance.get("runs", ())} & {*names}:

@@ -412,7 +412,7 @@ def _from_file(path: Path) -> dict[str, Setting]:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Return the contents of a TOML file; raises `ConfigError` or `OSError`."""
+    """Return the contents of a TOML file; raises `ConfigError` if it is not TOML, `OSError` if it cannot be read."""
     try:
         return tomllib.loads(read_file(path).decode("utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -17,9 +17,9 @@ from ftdrivers import sensors
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError
 
-# An emulated cell runs this many times faster than real time, which is its only difference from a real cell.
+# The emulated arm is this many times faster than a real one, which is the only difference from a real cell.
 TIME_SCALE = 20
-# Options of an emulated cell that runs in real time, as a recording in motion needs.
+# Options of an emulated cell whose arm moves at real speed, as a recording in motion needs.
 REAL_PACE = ("--time-scale", "1")
 _PERFECT = ("--gain", "0", "--cross-talk", "0")
 
@@ -81,7 +81,7 @@ class Station:
         path = control_path or made_by.get("control_path", "auto")
         values = {key: check_value("the run", key, value) for key, value in made_by.get("values", {}).items()}
         own = tuple(made_by.get("options", ()))
-        # Earlier versions emulated perfect sensors unless told otherwise, and runs of theirs must stay the same.
+        # A record without sensor errors is from an earlier version, whose emulated sensors were perfect by default.
         if "truth" in made_by and not any(map(any, made_by["truth"].get("sensor_error", ()))):
             own = (*_PERFECT, *own)
         return cls(name, (*own, *options), control_path=path, values=values)

@@ -106,7 +106,7 @@ class EmulatedClock(Clock):
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Stop the clock during the block, if the clock waits for this thread."""
+        """Stop the clock during the block, provided that this thread is inside `keeping_up`."""
         self._own.held = True
         try:
             yield
@@ -172,7 +172,7 @@ class EmulatedClock(Clock):
 class LocalClock(EmulatedClock):
     """Clock of a device that this process plays back: real time, but it waits for the threads in `keeping_up`."""
 
-    lead_s = 0.0  # a late record of a recording is also late in its playback
+    lead_s = 0.0  # no lead: records that were late when recorded are late in playback too
 
     def __init__(self) -> None:
         self._page = memoryview(bytearray(8 * (_SLOTS + 2 * _LOCAL_SLOTS))).cast("q")

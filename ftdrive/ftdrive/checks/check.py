@@ -27,13 +27,13 @@ class Check:
 
 
 def check_diagnosis(diagnosis: Diagnosis, device: str = "robot") -> Check:
-    """Return the check for a diagnosis that a driver made of its own device."""
+    """Return, as a `Check`, the result of a check that a driver made on its own device."""
     state: State = "ok" if diagnosis.passed else "failed"
     return Check(f"{device}.{diagnosis.name}", state, diagnosis.found, diagnosis.fix or None)
 
 
 def verdict(checks: Sequence[Check]) -> State:
-    """Return the worst state among some checks."""
+    """Return the worst of the states of some checks, such as "failed"."""
     states = {check.state for check in checks}
     return "failed" if "failed" in states else "warning" if "warning" in states else "ok"
 

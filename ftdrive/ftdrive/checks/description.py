@@ -276,7 +276,7 @@ class Description:
 
 
 def saved_at(draft: Path) -> str:
-    """Return when a draft was saved, such as "10:42", with the date unless it is today; raises `ConfigError`."""
+    """Return when a draft was saved, such as "10:42", with the date unless today; `ConfigError` if unreadable."""
     try:
         saved = datetime.fromisoformat(_draft(draft)["saved"])
     except (KeyError, TypeError, ValueError) as error:
@@ -294,7 +294,7 @@ def _draft(draft: Path) -> dict[str, Any]:
 
 
 def _identify_robot(host: str, model: str | None, clock: Clock) -> tuple[str, str]:
-    """Return the model of the arm at an address, and its report; raises `DeviceError`."""
+    """Return the model of the arm at an address, and its report; raises `DeviceError` if it does not answer."""
     with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig(""), clock=clock))) as arm:
         arm.open()
         info, remote = arm.identify(), arm.in_remote_control()
@@ -303,7 +303,7 @@ def _identify_robot(host: str, model: str | None, clock: Clock) -> tuple[str, st
 
 
 def _identify_sensor(url: str, clock: Clock) -> str:
-    """Return the report of the sensor at an address, with its rate; raises `DeviceError` or `UsageError`."""
+    """Return report and rate of the sensor at an address; `DeviceError` if silent, `UsageError` if no address."""
     with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url), clock=clock)) as sensor:
         info = sensor.identify()
         rate_Hz = len(sensor.collect(_LOOK_S).t_host_ns) / _LOOK_S

@@ -104,7 +104,7 @@ def _parse_cell(path: Path, name: str, table: Any) -> StoredCell:
     config, days, serial = (table.get(key) for key in _KEYS)
     if not isinstance(config, str) or not config:
         raise ConfigError(f'{place} config is {config!r}: give the path of its ftdrive.toml, such as "{name}.toml"')
-    if isinstance(days, bool) or not isinstance(days, int | float) or not 0 < days <= MOST_DAYS:  # false for nan
+    if isinstance(days, bool) or not isinstance(days, int | float) or not 0 < days <= MOST_DAYS:  # NaN fails
         raise ConfigError(f"{place} verify_every_days is {days!r}: give a number of days, such as 7")
     if serial is not None and not (isinstance(serial, str) and serial):
         raise ConfigError(f'{place} arm_serial is {serial!r}: give it as a string, such as "20225500001"')

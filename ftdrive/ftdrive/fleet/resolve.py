@@ -130,7 +130,7 @@ class Comparison:
 
     @property
     def has_other_verdict(self) -> bool:
-        """Whether the verdict differs; a missing calibration is treated as rejected."""
+        """Whether the two verdicts differ; a run without a calibration counts as rejected."""
         return self.verdict != (self.verdict_before or "rejected")
 
 

@@ -29,7 +29,7 @@ COMPONENTS: Final = tuple(f"{name} bias {axis}" for name in ("force", "torque") 
 
 
 def fleet_state(store: Store, now: datetime) -> Fleet:
-    """Return the states of all cells of a store, and the findings across them; raises `BadStore`."""
+    """Return the states of a store's cells, and findings across them; raises `BadStore` if it cannot be read."""
     return fleet_of(Observed.read(store, now), store)
 
 
@@ -301,13 +301,13 @@ def _mm(point_m: Array | None) -> str:
 # Significance level per component and sensor: in one of 80 fleets of 200 sensors, one sensor exceeds it by chance, and
 # a finding needs two sensors.
 SURE_OF_TEMPERATURE: Final = 1e-5
-# Smallest number of verifications of a calibration.
+# A calibration counts for findings on temperature if it has at least this many verifications.
 FEWEST: Final = 8
 
 
 @dataclass(slots=True, eq=False)
 class _SensorSums:
-    """Sums (6,) over the calibrations of one sensor, and the cells of the sensor."""
+    """Sums (6,) for the regression of one sensor's bias on temperature, over its calibrations, and its cells."""
 
     cells: set[str]
     xx: Array
@@ -317,7 +317,7 @@ class _SensorSums:
 
 
 def _temperature_findings(observed: Observed) -> Iterator[FleetFinding]:
-    """Yield findings about sensor models with two or more sensors whose bias depends on temperature."""
+    """Yield a finding per sensor model of which two or more sensors have a bias that depends on temperature."""
     models = dict[str, dict[str, _SensorSums]]()
     for cell in observed.cells:
         for result in observed.results[cell.name]:
@@ -370,7 +370,7 @@ def _finding(model: str, sensors: Mapping[str, _SensorSums]) -> Iterator[FleetFi
 
 
 def _p_values(sums: _SensorSums) -> Array:
-    """Return the p-value (6,) of each component: the larger one from a chi-squared test and an F-test."""
+    """Return p-values (6,), for no effect of temperature on a bias component: the larger of a chi² and an F-test."""
     usable = sums.xx > 0
     chi2 = np.where(usable, sums.xy**2 / np.where(usable, sums.xx, 1.0), 0.0)
     rest = np.maximum(sums.yy - chi2, 1e-12) / sums.dof

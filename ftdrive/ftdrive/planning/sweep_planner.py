@@ -95,7 +95,7 @@ def plan_sweep(
 
 
 def _centres(certifier: Certifier, q_now: Array) -> Iterator[Array]:
-    """Yield postures for the centre of a sweep: the current one, then with another wrist, then with another arm."""
+    """Yield postures for the centre of a sweep: the current one, other wrist angles, then other angles 1 to 3 too."""
     yield q_now
     for turn in (np.pi / 2, -np.pi / 2):
         yield np.concatenate([q_now[:4], [turn], q_now[5:]])

@@ -253,7 +253,7 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
 
 
 def host_and_port(option: str, text: str, example: str, *, lowest: int = 1) -> tuple[str, int]:
-    """Parse HOST:PORT, with brackets around an IPv6 address. Raises `ConfigError`."""
+    """Parse HOST:PORT, with brackets around an IPv6 address. Raises `ConfigError` for any other text."""
     host, _, port = text.rpartition(":")
     if not host or not (port.isascii() and port.isdecimal()) or not lowest <= int(port) < 65536:
         raise ConfigError(f"{option} is '{text}': give HOST:PORT, such as {example}")

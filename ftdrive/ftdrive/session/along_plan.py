@@ -268,7 +268,7 @@ class AlongPlan:
             questions.ask_reduced(assumed=False)
 
     def judge_completed(self, missing: str = "") -> None:
-        """Record that this session completed the plan, or show why not; `missing` describes missing poses or moves."""
+        """Record that this arm completed the plan, or show why not; `missing` describes missing poses or moves."""
         if not self.todo or self.before.known:
             return
         if missing:

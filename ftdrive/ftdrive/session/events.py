@@ -88,7 +88,7 @@ class RunOpened(Event):
 
     folder: str
     resume: str
-    """The command that resumes the run; empty for a run in motion, which cannot be resumed."""
+    """Command that resumes the run after an interruption; empty for a recording in motion, which cannot be resumed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,7 +101,7 @@ class StateChanged(Event):
     stops: int | None = None
     """Number of stops in the tour, including the return to the first pose."""
     number: int | None = None
-    """Number of the orientation in the plan; None without one."""
+    """Number of the pose's orientation in the plan; None if no pose is meant."""
     words: str = ""
     """Cause of a STOP or HOLD; otherwise what is happening or what to do."""
 
@@ -229,7 +229,7 @@ class Compared(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Weighed(Event):
-    """The identified mass, once the running fit is reliable, and the payload set in the controller."""
+    """Mass from the running fit, once the fit is reliable, and the payload set in the controller to compare it with."""
 
     mass_kg: float
     """Mass that the sensor carries, without the sensor and its adapter."""

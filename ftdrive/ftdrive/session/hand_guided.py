@@ -149,7 +149,7 @@ class HandGuided:
         # State reported when the arm came to rest; None while it moves.
         self._rests_at: ArmState | None = None
         self._still_since_s = 0.0
-        # Whether the pose at which the arm stands was taken or left out.
+        # Whether the pose at which the arm stands now was already taken or left out.
         self._dealt_with = False
         self._program_ran = False
         # State of the pendant's program as the controller reports it; empty before the program starts.
@@ -233,7 +233,7 @@ class HandGuided:
         return not (self._paused or self._fault) and (not self._listen or self._program in {"playing", "stopped"})
 
     def _at_rest(self, state: ArmState) -> bool:
-        """Return whether the arm has stood still long enough at a pose that was neither taken nor left out."""
+        """Return whether the arm has stood still long enough at a new pose, neither taken nor left out before."""
         still = float(np.abs(state.qd_rad_s).max()) < STILL_RAD_S
         if self._rests_at is not None and turned_rad(self._rests_at, state) > LEFT_RAD:
             self._rests_at = None
@@ -324,7 +324,7 @@ class HandGuided:
         return True
 
     def _deal_with(self) -> None:
-        """Finish the current pose; the next measurement needs another pose."""
+        """Mark the current pose as finished: the next measurement needs another pose."""
         self._dealt_with = True
         words = "the program goes on" if self._listen else "move on to another orientation"
         if self._may_finish:
@@ -337,7 +337,7 @@ class HandGuided:
 
     def _learn(self, record: PoseRecord, judged: Estimated | Compared) -> None:
         self._taken[record.stop] = record
-        # The quietest pose gives the noise of the undisturbed sensor.
+        # The smallest noise among the poses is taken for that of the undisturbed sensor.
         if record.steady:
             std = record.samples.wrench.std(axis=0, ddof=1)
             self._level = std if self._level is None else np.minimum(self._level, std)

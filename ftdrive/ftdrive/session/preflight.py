@@ -42,7 +42,7 @@ _ROUNDED_RAD: Final = float(np.radians(1))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Before:
-    """Everything that is known before the first motion: the input to the checks."""
+    """Everything that is known before the first motion of a session: the input to the preflight checks."""
 
     cell: OpenCell
     config: CellConfig
@@ -56,7 +56,7 @@ class Before:
     quiet: FtSamples
     """Samples of the resting sensor over `LISTEN_S`."""
     resumed: bool
-    """Whether part of the plan has been driven before."""
+    """Whether part of the plan was driven before, because the run is resumed or goes on after a stop."""
     task: Task
 
     def quiet_std(self, average_s: float) -> Array:

@@ -23,7 +23,7 @@ from ftdrive.session.session import run_calibration
 
 
 class NoOperator:
-    """An operator who sees nothing and presses no key; a question raises `Declined`."""
+    """Stands in for an operator: shows nothing and returns no key; any question raises `Declined`."""
 
     has_keys = False
     pressed_by = "the operator"

@@ -280,7 +280,7 @@ def send(
     read_back, failure = None, ""
     try:
         _set(arm, push.new, guard)
-        arm.close()  # so that only settings that persist without the program are read back
+        arm.close()  # the settings that outlast the program are to be read back
         arm.open()
         read_back = arm.controller_settings()
     except BaseException as error:  # including Ctrl-C

@@ -224,17 +224,17 @@ class Contact:
 
     @property
     def direction(self) -> Array:
-        """(3,) unit vector of the force at the peak; zero for a pure torque."""
+        """(3,) unit vector of the force of `peak`; zeros if the contact exerts a torque only."""
         return self.peak[:3] / (np.linalg.norm(self.peak[:3]) or 1.0)
 
     @property
     def line_m(self) -> Array:
-        """(3,) point on the line of action of the force nearest to the reference point, axes of the frame."""
+        """(3,) point on the force's line of action that is nearest to the reference point, axes of the frame, m."""
         force_N = self.peak[:3]
         return np.cross(force_N, self.peak[3:]) / (float(force_N @ force_N) or np.inf)
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return the values of the contact event, without the frame."""
+        """Return the values of the contact's event in a stream, except for its frame."""
         return {
             "duration_s": self.duration_s,
             "peak_N": self.peak_N,

@@ -235,7 +235,7 @@ class PlotColumns:
     high: Array
     """(6, n) largest value in each column; NaN in a column without samples."""
     in_contact: NDArray[np.bool_]
-    """(n,) whether the column contains a contact."""
+    """(n,) whether each column contains a contact."""
     start_ns: int
     column_ns: int
     marks: set[int]

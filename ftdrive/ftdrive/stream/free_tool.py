@@ -54,9 +54,9 @@ _RATE_N = 5.0
 _RATE_VARIANCE = np.square(_RATE_N / 3600 * _UNIT)
 # Turn of the arm, rad, over which the local error of the calibration decorrelates to 1/e.
 _LOCAL_RAD = 0.5
-# Gate on the squared innovation of a window; a free tool exceeds it about once an hour.
+# Gate: largest squared Mahalanobis innovation of an accepted window; a free tool exceeds it about once an hour.
 _GATE = float(chdtri(6, 1e-4))
-# Degrees of freedom of Student's distribution: outliers get less weight, because vibration has heavy tails.
+# Degrees of freedom of the noise's Student distribution: outliers weigh less, because vibration has heavy tails.
 _TAILS = 4.0
 # Below this squared Mahalanobis distance two estimates (mass and moment, four numbers) count as the same part.
 _SAME = float(chdtri(4, 1e-3))

@@ -296,7 +296,7 @@ class Processor:
 
     @property
     def frame(self) -> WrenchFrame:
-        """Axes and reference point of the wrench; setting them adds an event. Raises `ConfigError`."""
+        """Axes and reference point of the wrench; a change adds an event, or raises `ConfigError` if unsupported."""
         return self._frame
 
     @frame.setter
@@ -312,7 +312,7 @@ class Processor:
 
     @property
     def settings(self) -> Stages:
-        """Settings of the stages; setting them adds an event. Raises `ConfigError`."""
+        """Settings of the stages; a change adds an event, or raises `ConfigError` if a setting is missing."""
         return self._settings
 
     @settings.setter

@@ -217,7 +217,7 @@ class Stream(Displayed):
 
     @property
     def frame(self) -> WrenchFrame:
-        """Axes and reference point of the wrench; setting them adds an event. Raises `ConfigError`."""
+        """Axes and reference point of the wrench; a change adds an event, or raises `ConfigError` if unsupported."""
         return self.processor.frame
 
     @frame.setter
@@ -226,7 +226,7 @@ class Stream(Displayed):
 
     @property
     def stages(self) -> Stages:
-        """Settings of the stages; setting them adds an event. Raises `ConfigError`."""
+        """Settings of the stages; a change adds an event, or raises `ConfigError` if a setting is missing."""
         return self.processor.settings
 
     @stages.setter

@@ -156,7 +156,7 @@ class Scale:
 
 
 def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, Array, Array]:
-    """Return R_base_flange (3, 3), the mean (6,) at rest, and its covariance (6, 6). Raises `CannotWeigh`."""
+    """Return R_base_flange (3, 3), mean (6,) and its covariance (6, 6); raises `CannotWeigh` unless at rest."""
     if len(rows) < LEAST_SAMPLES or rows.t_host_ns[-1] - rows.t_host_ns[0] < 0.95e9 * WEIGH_S:
         raise CannotWeigh("samples")
     if not is_still(rows):

@@ -314,7 +314,7 @@ def _begins_here(certifier: Certifier, q_now: Array, q_rad: Array, part: Nodes) 
 
 
 def _others(certifier: Certifier, q_now: Array, candidates: Array) -> Array:
-    """Return the postures (k, 3) of joints 1 to 3, not the current one, that reach the most tool directions."""
+    """Return those postures (k, 3) of joints 1 to 3 on a grid that reach the most tool directions."""
     postures = grid(certifier, q_now, POSTURE_STEP_DEG)
     looks = candidates[np.linspace(0, len(candidates) - 1, LOOKS).astype(int)]
     q = np.array([wrist_inverse(certifier.arm.kinematics, posture, looks) for posture in postures])  # (m, LOOKS, 2, 6)

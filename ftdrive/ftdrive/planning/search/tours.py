@@ -32,7 +32,7 @@ NEAREST_OF_EACH = 2
 MANY_GROUPS, NEAREST_OF_ALL = 60, 40
 # Number of neighbours, about, to which each joint vector is linked when connected parts are searched.
 NEIGHBOURS = 10
-# So many joint vectors of each group are used; the larger number if no tour connects the smaller number.
+# At most this many joint vectors of each group are used; the larger number if no tour is found with the smaller.
 MOST_NODES = (25, 60)
 
 
