@@ -62,9 +62,9 @@ class SessionOptions:
     """Move at the speeds of the plan if this arm has completed the plan slowly before."""
     plan: Path | None = None
     output: Path | None = None
-    """New file in which the plan is also saved; None for none."""
+    """New file, outside the run, in which the plan is saved; None if no such file is wanted."""
     png: Path | None = None
-    """New PNG file in which the plan is drawn; None for none."""
+    """New PNG file in which the plan is drawn; None if no drawing is wanted."""
     watch: Callable[[Certifier, RangeGuard], Guard] | None = None
     """Called before the first question; returns a further guard, which only observes and never trips."""
     resume: Path | None = None

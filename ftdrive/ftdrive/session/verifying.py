@@ -201,7 +201,7 @@ class RunningComparison:
 
 
 def save_wanted_update(verified: Verified, update: Answer, ask: Callable[[Question], str]) -> Path | None:
-    """If `verified` has an update and the operator wants it, save it as a new calibration and return the path."""
+    """Save the update of a verification as a new calibration if the operator wants it; return its path or None."""
     if verified.passed or verified.update is None or update == "no":
         return None
     question = Question(f"An update of {verified.updated} is sufficient. Save it as a new calibration?")
