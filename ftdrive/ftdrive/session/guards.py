@@ -99,7 +99,7 @@ class Limits:
 
     @classmethod
     def of(cls, clock: Clock) -> Self:
-        """Return the limits for a cell with this clock; those of time are wider if an emulated clock leads its arm."""
+        """Return the limits for a cell with this clock. An emulated clock may lead its arm, so it gets longer times."""
         usual = cls()
         return cls(link_usual_s=usual.link_usual_s + clock.lead_s, stalled_s=clock.patience_s(usual.stalled_s))
 

@@ -62,7 +62,7 @@ class SessionOptions:
     """Move at the speeds of the plan if this arm has completed the plan slowly before."""
     plan: Path | None = None
     output: Path | None = None
-    """New file, outside the run, in which the plan is saved; None if no such file is wanted."""
+    """New file in which the plan is saved as well; None if no such file is wanted."""
     png: Path | None = None
     """New PNG file in which the plan is drawn; None if no drawing is wanted."""
     watch: Callable[[Certifier, RangeGuard], Guard] | None = None
