@@ -311,8 +311,8 @@ CODES: Final[Mapping[str, Code]] = {
         "data{corrections:?, such as |}{corrections:axes}"),
     # Units, drift and changes of one session
     "bias_implausible": Code(_REJECT_OR_LIMIT, "the bias is {force_N:.5g} and {torque_Nm:.5g} for a weight of "
-        "{weight_N:.3g}, as with raw counts", "convert the counts to N and N·m with the factors of the sensor. A known "
-        "mass shows the factor of the force (--mass-kg){unit_N:scale}"),
+        "{weight_N:.3g}, as with raw counts", "convert the counts to N and N·m with the sensor's factors. With a "
+        "known mass, solve gives that of the force (--mass-kg){unit_N:scale}"),
     "payload_units": Code(_LIMIT, "the load on the sensor is {load_kg:.2f}, but the payload in the controller implies "
         "{expected_kg:.2f}", "check the units of the sensor{units:units} before you correct the payload"),
     "com_shifted": Code(_REJECT_OR_LIMIT, "from {pose:poses} on, the centre of mass is shifted by {shift_mm:.2g}, as "
@@ -422,7 +422,7 @@ CODES: Final[Mapping[str, Code]] = {
         "60 °/s or more"),
     # How well the data fit
     "gain_not_modelled": Code(_LIMIT, "the gain is off by {gain_percent:.1f}, which this method ignores (residual "
-        "{residual_N:.2g}, or {free_N:.2g} if the gain is estimated)", "solve with method ml"),
+        "{residual_N:.2g}; {free_N:.2g} with the gain)", "solve with method ml"),
     "force_error": Code(_REJECT_OR_LIMIT, "the force error is {share_percent:.1f} of the weight ({error_N:.2g}, "
         "{source}), limit {limit_percent:g}", "check cables, contact and orientations, and take more poses"),
     "torque_error": Code(_REJECT_OR_LIMIT, "the torque error is {share_percent:.1f} of the weight times {lever_m:.2g} "

@@ -26,7 +26,7 @@ from ftdrivers.streaming.sensor import StreamingSensor
 
 ARMS: Mapping[str, str] = {"ros2": "ftdrivers.ros2.arm:Ros2Arm", "ur": "ftdrivers.ur.arm:UrArm"}
 
-# Extra of ftdrive that installs a library which a driver needs, by the name of the library.
+# The extra of ftdrive that installs a library for a driver; the keys are the names of the libraries.
 _EXTRAS: Mapping[str, str] = {"pynetft": "netft"}
 
 _EXAMPLES = (
@@ -101,7 +101,7 @@ class Options:
         return value
 
     def configured(self) -> dict[str, Fact]:
-        """Return the options `serial` and `range`, which every sensor has, as facts."""
+        """Return what the address gives as `serial` and `range`, options of every sensor, as facts about the device."""
         facts = {}
         if "serial" in self._given:
             facts["serial"] = Fact(self.text("serial", ""), "configured")

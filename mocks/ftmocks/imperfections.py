@@ -53,7 +53,7 @@ class Imperfections:
     Parameters
     ----------
     ripple, ring
-        Vibration while joints rotate, and after they accelerate, as multiples of the sizes above.
+        Vibration while joints rotate, and after they accelerate, as multiples of this module's sizes.
     gear_ratio
         Revolutions of the motor per revolution of the joint.
     servo_lag_s

@@ -136,7 +136,7 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     estimated_15[:15] = estimated
     gain = estimated_15 @ G
     mixed = kept - gain @ K
-    # The errors of kept parameters affect the new parameters, so both are correlated.
+    # The errors of kept parameters affect the new parameters, so the two are correlated.
     covariance = gain @ noise @ gain.T + mixed @ C @ mixed.T
     covariance = (covariance + covariance.T) / 2
     joint, dof = calibration.with_joint(covariance), 6 * n - len(x)

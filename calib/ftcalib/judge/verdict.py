@@ -304,7 +304,7 @@ def find_mistakes(case: Case, quality: Quality) -> list[Finding]:
 
 
 def find_other_poses(case: Case, quality: Quality) -> list[Finding]:
-    """Return a finding for a weight in other poses; other mistakes or a change may explain the data better."""
+    """Return a finding if wrenches fit other poses than their own and no other mistake or change fits better."""
     if not quality.suspect:
         return []
     found, order = case.found, _some_runs(case.t_s, len(quality.used))

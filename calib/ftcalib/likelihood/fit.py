@@ -129,7 +129,7 @@ class Estimate(Calibrated):
 
     @cached_property
     def residuals(self) -> Array:
-        """(n, 6) measured minus predicted wrench; the prediction has the mean bias, gain and cross-talk."""
+        """(n, 6) measured minus predicted wrench; the prediction includes the mean bias, gain and cross-talk."""
         added = 0.0 if self.response is None else self.response.wrench(self.parameters, self.R_base_flange)
         return np.asarray(self.wrench - predict(self.on_average, self.R_base_flange) - added)
 

@@ -42,7 +42,7 @@ class Control(ABC):
 
     @property
     def has_ended(self) -> bool:
-        """Whether the control program has reported its end. A program that runs afterwards is another one."""
+        """Whether the control program has reported its end. A program that runs afterwards is a different one."""
         return False
 
     @abstractmethod

@@ -39,7 +39,7 @@ class UrTiming:
     starting_s: float = 4.5
     """Time-out from the start of the control process until its program plays."""
     call_s: float = 2.0
-    """Time-out for a reply of the control process, which takes 10 ms. Motion is watched meanwhile."""
+    """Time-out for a reply from the control process; 10 ms are usual. Guards watch the motion meanwhile."""
     progress_s: float = 0.4
     """Time-out for the question whether a move has ended, which takes 0.03 ms. The guard is not called meanwhile."""
     ours_s: float = 0.4

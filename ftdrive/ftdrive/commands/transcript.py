@@ -104,7 +104,7 @@ def _record_bytes(sensor: str, path: Path, duration_s: float, *, kept: bool = Tr
 def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
     """Play the transcript FILE to the unmodified driver, and print what the driver measures.
 
-    An interrupted recording is played to its end.
+    An interrupted transcript is played up to its last complete line.
     """
     check_simulate(simulate, real={"FILE": file}, emulated={"--sensor": sensor})
     if simulate:

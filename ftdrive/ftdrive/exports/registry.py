@@ -212,7 +212,7 @@ def _inertia_note(v: _Values) -> str:
     motion = v.calibration.motion
     if motion is None or v.inertia_kg_m2 is None:
         why = "" if motion is None else " well enough"
-        return f"The inertia was not identified{why}: zeros stand for a point mass. Take the values of a CAD model."
+        return f"The inertia was not identified{why}: zeros stand for a point mass. Use the values from a CAD model."
     sigma = 1e3 * float(np.sqrt(np.diag(motion.covariance)[15:21].max()))
     return f"The inertia was identified from motion, with a sigma of {sigma:.2g} g·m2 at most."
 

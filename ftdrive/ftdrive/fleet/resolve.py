@@ -225,7 +225,7 @@ class SolvedAgain:
             f"{len(self.other_verdict)} with another verdict."
         )
         for entry in self.changed:
-            how = "was known and differs" if entry["sigmas"] is None else f"changed by {entry['sigmas']:+.1f} sigma"
+            how = "is no longer as known" if entry["sigmas"] is None else f"changed by {entry['sigmas']:+.1f} sigma"
             yield f"changed: {entry['run']}: {entry['parameter']} {how}"
         for entry in self.other_verdict:
             why = f" ({entry['finding']['words']})" if entry["finding"] else ""

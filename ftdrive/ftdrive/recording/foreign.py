@@ -190,7 +190,7 @@ def _read_topics(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[_
 
 
 def _number_column(reader: "AnyReader", topic: str, messages: Sequence[_Message], count: int) -> _Column:
-    """Return times (n,), ns, from the stamps or else of receipt, and the `count` numbers that follow each header."""
+    """Return times (n,), ns, those of receipt if there are no stamps, and the `count` numbers after each header."""
     if not messages:
         raise BadDataset(f"{topic} has no message: give another topic")
     received_ns = np.array([received for received, _ in messages])

@@ -371,7 +371,7 @@ def read_ahead(items: Iterator[T]) -> Generator[T, None, None]:
 
 
 def in_blocks(parts: Iterable[Measured]) -> Iterator[Measured]:
-    """Regroup parts of any size into blocks of `PIECE_ROWS` samples; before raising an error, yield those before it."""
+    """Regroup parts of any size into blocks of `PIECE_ROWS` samples. An error is raised after all earlier rows."""
     waiting, count, events, share, failure = list[Paired](), 0, list[StreamEvent](), 0.0, None
     try:
         for part in parts:

@@ -229,7 +229,7 @@ class AlongPlan:
         with watcher:  # the watcher also sees an emergency stop during a question
             if options.questions and self.todo:
                 if before.certifier.arm.hung is not None:
-                    words = "Is the weight off the tool? You hang it when the arm is at the first pose."
+                    words = "Is the weight off the tool? Hang it only when the arm is at the first pose."
                     cell.journal.require(words, assumed=before.known and not options.real)
                 questions.ask(way, assumed=before.known and not arm_moves(way))  # this approach was never driven before
             run = self._session.resumed or self._keep_plan()

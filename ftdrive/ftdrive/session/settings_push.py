@@ -62,7 +62,7 @@ class Receipt:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a receipt, or the newest one in a run folder that restored nothing; raises `BadDataset` on failure."""
+        """Read a receipt, or a run folder's newest one that is not of a restoration; raises `BadDataset` on failure."""
         if path.is_dir():
             return cls._newest(path)
         try:

@@ -16,7 +16,7 @@ from ftdrive.store import database
 from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import STORED, Record, StoredCell, StoredResult, read_records, record_paths
 
-# Time-out of waiting for the lock of another writer, s.
+# Time-out when waiting for another writer's lock, s.
 WAIT_S = 5.0
 
 _MOST = 5000

@@ -39,7 +39,7 @@ _STILL_RAD = 5e-4
 
 @dataclass(frozen=True, slots=True)
 class FeedNote:
-    """An event of the stream, or the answer to a request of the operator, as screen and page show it."""
+    """An event in the stream, or the answer to an operator's request, as shown on the screen and the page."""
 
     t_host_ns: int | None
     text: str

@@ -548,7 +548,7 @@ class Following:
         self.filter = FreeToolFilter(calibration.mass_kg, calibration.parameters.p_sensor_com_m, drift_per_h)
         self._reported_s = -np.inf
         self.found: list[tuple[Tracked, list[StreamEvent]]] = []
-        """Estimate and events after each window, until the monitor of the tool takes them."""
+        """Estimate and events of each window, kept until the tool's monitor fetches them."""
         self._is_tracked = False
         self.tracked: Tracked | None = None
         """Newest estimate; None until tracking has begun and a window is complete."""

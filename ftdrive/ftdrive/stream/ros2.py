@@ -114,7 +114,7 @@ def pack_transforms(t_utc_ns: NDArray[np.int64], transforms: Sequence[Transform]
 
 
 def _stamps(t_utc_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return ROS stamps (n,) as integers of 8 bytes: seconds in the lower four bytes, nanoseconds in the upper ones."""
+    """Return ROS stamps (n,) as 8-byte integers: seconds in the lower four bytes, nanoseconds in the upper four."""
     seconds, ns = np.divmod(t_utc_ns, 1_000_000_000)
     return np.asarray(seconds + (ns << 32))
 

@@ -53,7 +53,7 @@ class WrenchFrame:
 
     @property
     def id(self) -> str:
-        """Name of the frame in messages: `sensor`, `base_at_tcp` or `base_at_0_0_0.15_m` (a point from the flange)."""
+        """Name of the frame in messages: `sensor`, `base_at_tcp` `base_at_0_0_0.15_m` (from the flange origin)."""
         if self.axes == self.about:
             return self.axes
         if isinstance(self.about, str):

@@ -29,7 +29,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "compensate": "Compensate a recording. Needs no device.",
     "stream": "Serve the wrench to Foxglove, Lichtblick and PlotJuggler.",
     "serve-load": "Give weight and contact wrench to a UR program.",
-    "ros2": "Publish the wrench as topics of ROS 2, with tare service and diagnostics.",
+    "ros2": "Publish the wrench as ROS 2 topics, with a tare service and diagnostics.",
     "replay": "Repeat a recorded run with the same routine and solver.",
     "bundle": "Write a run into one file for a bug report, without addresses.",
     "export": "Write a plan or a calibration for another program.",

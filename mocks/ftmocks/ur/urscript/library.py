@@ -489,7 +489,7 @@ def set_standard_analog_out(program: Caller, n: Value, f: Value) -> None:
 
 
 class _WithoutEffect:
-    """A function that only checks its arguments; a question mark marks an optional argument."""
+    """A function that only checks its arguments; `?` in `parameters` marks an optional argument."""
 
     def __init__(self, parameters: str) -> None:
         self.__signature__ = Signature(
