@@ -1,4 +1,4 @@
-"""Reading and writing of files, which are written completely or not at all, never overwritten, and state their format.
+"""Read and write files. A file is written completely or not at all, is never overwritten, and states its format.
 
 A JSON file has a `checksum`, which reveals damage and edits.
 """

@@ -27,7 +27,7 @@ _LISTEN_BUS_S = 1.0
 
 
 class Answer(NamedTuple):
-    """Answer of a probe: a sensor that was found, or one that could not be asked safely."""
+    """Result of a probe: a sensor that was found, or one that could not be queried safely."""
 
     url: str | None
     """Address of the sensor; None if it was not asked."""

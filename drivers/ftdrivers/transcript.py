@@ -288,7 +288,7 @@ def _parsed(line: bytes) -> Any:
 def _checked_header(path: Path, line: Any) -> Mapping[str, Any]:
     found = line.get("format") if isinstance(line, dict) else None
     if found != FORMAT:
-        raise BadTranscript(f"{path}: the format in the first line is {found!r}; give a file with {FORMAT}")
+        raise BadTranscript(f"{path}: the format in the first line is {found!r}; give a file in the format {FORMAT}")
     if not isinstance(line.get("url"), str) or not isinstance(line.get("duration_s"), int | float):
         raise BadTranscript(f"{path}: url or duration_s is missing in the first line; record it again")
     split_url(line["url"])

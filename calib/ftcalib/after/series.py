@@ -329,9 +329,9 @@ class BiasTemperature:
     coldest_C: float
     warmest_C: float
     error: Array
-    """(2,) leave-one-out rms error of the bias per axis, predicted with the temperature, N and N·m."""
+    """(2,) leave-one-out rms error per axis of the bias predicted from the temperature: forces, N; torques, N·m."""
     error_without: Array
-    """(2,) leave-one-out rms error of the bias per axis, predicted without the temperature, N and N·m."""
+    """(2,) leave-one-out rms error per axis of the bias predicted without it: forces, N; torques, N·m."""
     p_value: Array
     """(2,) p-values of the slopes of force and torque."""
 

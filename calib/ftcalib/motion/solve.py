@@ -141,7 +141,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     mistakes, undo = _find_mistakes(data, rows, known, g_m_s2) if positions else ([], unchanged)
 
     def rows_at(delay_s: float) -> tuple[MotionRows, MotionRows]:
-        """Return the rows of wrench and motion at a delay, without mistakes, and those slow enough to be used."""
+        """Return rows of wrench and motion for a delay, with mistakes undone, and those slow enough to be used."""
         others = undo(motion_rows(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), rows.row_s))
         return others, _select_rows(others, limit_rad_s)
 

@@ -84,7 +84,7 @@ class DeviceClock:
         leads_s = (t_device_s - self._first[0]) - (heard_s - self._first[1])
         lead_s = float(leads_s[-1])
         step_s = lead_s - self._lead_s
-        # samples of a clock that is only slow fall behind steadily, and are not late
+        # samples of a clock that is slow, and has no other fault, lag ever more; they do not count as late
         self._lead_s = max(lead_s, self._lead_s - _CLOCK_DRIFT * (heard_s - heard_before_s))
         back_s = float((np.concatenate([[before_s], t_device_s[:-1]]) - t_device_s).max())
         if back_s > 0:

@@ -240,7 +240,7 @@ class Opening:
             fix = _LOCAL_X if version[0] >= POLYSCOPE_X else _LOCAL
             raise ConnectError(f"{self.host} is not in remote control", fix)
         if self.program.left_behind and self.reader.look().program_state != PROGRAM_STOPPED:
-            log.warning("%s still runs our earlier control program; stopping it", self.host)
+            log.warning("%s is still running our earlier control program; stopping it", self.host)
             services.stop()
 
     def _require_no_program(self) -> None:

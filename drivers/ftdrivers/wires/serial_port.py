@@ -164,7 +164,7 @@ class SerialPort:
         except (ValueError, *LINK_ERRORS) as exc:
             self.close()
             fix = "plug it in, end other programs that use it, and add this user to the group of the port"
-            raise refusal(self._owner, self._path, exc, f"the port does not open ({exc})", fix) from exc
+            raise refusal(self._owner, self._path, exc, f"the port cannot be opened ({exc})", fix) from exc
         with contextlib.suppress(ValueError, NotImplementedError, *LINK_ERRORS):
             self._port.set_low_latency_mode(True)  # the latency of some USB adapters becomes 1 ms instead of 16 ms
 

@@ -240,7 +240,7 @@ def _solve_together(
         with unpack(source) as place:
             data = read_place(place, options)
             if not isinstance(data, RecordedData):
-                raise ConfigError(f"--together needs poses at rest, and {source} is in motion: leave it out")
+                raise ConfigError(f"--together needs poses at rest, but {source} is in motion: leave out {source}")
             # without the earlier result of a run with a new tool, which would otherwise be counted once per run
             results.append(_solve_shown(replace(data, earlier=None), options))
     result = together(results)

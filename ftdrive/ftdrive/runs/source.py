@@ -48,7 +48,7 @@ class RecordedRun:
         """Go to the next recorded stop. Raises `ValueError` unless it has these joint angles (6,)."""
         self._stop += 1
         if not np.array_equal(q_rad, self._records[self._stop].pose.q_rad):
-            raise ValueError(f"stop {self._stop + 1} of the recording does not have the joint angles of the routine")
+            raise ValueError(f"the joint angles at stop {self._stop + 1} of the recording are not those of the routine")
 
     def wait_until_still(self, **_: object) -> None:
         """Return at once, because a recorded arm is still; `state` is then again the one before the samples."""

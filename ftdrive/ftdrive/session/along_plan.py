@@ -231,7 +231,7 @@ class AlongPlan:
                 if before.certifier.arm.hung is not None:
                     words = "Is the weight off the tool? Hang it only when the arm is at the first pose."
                     cell.journal.require(words, assumed=before.known and not options.real)
-                questions.ask(way, assumed=before.known and not arm_moves(way))  # this approach was never driven before
+                questions.ask(way, assumed=before.known and not arm_moves(way))  # this approach has never been driven
             run = self._session.resumed or self._keep_plan()
             book = PoseBook(cell, run, self.judge, before.certifier.scene.down_base)
             guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)

@@ -47,7 +47,7 @@ class Limits:
     """Limits of the guards and of the preflight checks; the hazard table quotes them."""
 
     frozen_rad: float = float(np.radians(0.5))
-    """Largest allowed motion of a joint that should rest."""
+    """Largest allowed motion of a joint that should be at rest."""
     tracking_rad: float = float(np.radians(2.0))
     """Largest allowed distance of a moving joint from the planned path in joint space."""
     flange_m: float = 0.002

@@ -317,7 +317,7 @@ def moves_s(plan: Plan, todo: Sequence[int], approach: Approach) -> float:
 
 
 def _chosen_sampling(before: Before, todo: Sequence[int]) -> tuple[Sampling, Array]:
-    """Return the sampling of each pose, configured or chosen, and the standard deviation (6,) of its average."""
+    """Return how a pose is sampled, as configured or chosen, and the standard deviation (6,) of its mean wrench."""
     sampling, sigma = _usual_sampling(before, todo)
     load = before.task.load
     if load is not None and not load.gripped:

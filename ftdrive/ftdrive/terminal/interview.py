@@ -44,7 +44,7 @@ class Interview:
             return
         when = saved_at(self._draft)
         if asked:
-            words = f"Continue with the answers of {when}? [yes/no]: "
+            words = f"Continue with the answers from {when}? [yes/no]: "
             if self._until(words, None, "an answer", _yes_or_no, back=False).strip().lower() == "no":
                 self._draft.unlink()
                 return

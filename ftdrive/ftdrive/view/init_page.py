@@ -25,7 +25,7 @@ from ftdrivers.errors import DeviceError
 from ftdrivers.ur.kinematics import model_named
 
 _ROWS: Final = {TOOL: ("Cylinder", "Cylinders"), WALLS: ("Wall", "Walls and tables"), BOXES: ("Box", "Boxes")}
-# Parts of the form in order: sections of the configuration, and questions with several answers, such as boxes.
+# Parts of the form in order: sections of the configuration, and questions with several answers, such as walls.
 _PARTS: Final = ("robot", "sensor", "tool", TOOL, "workcell", WALLS, BOXES)
 # Largest number of answers to one question, and of viewers' actions that are queued while a device is read.
 _MOST_ROWS, _MOST_USES = 30, 100

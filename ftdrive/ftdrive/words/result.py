@@ -74,7 +74,7 @@ def error_in_words(result: CalibrationResult) -> str:
 
 
 def error_source(result: CalibrationResult) -> str:
-    """Return a text about how the compensation error was determined, with the error predicted from noise alone."""
+    """Describe how the compensation error was determined, and state the error predicted from noise alone."""
     sources = ["predicted from the noise: {:.4f} N, {:.5f} N·m".format(*result.predicted_error())]
     if result.motion is None and not result.noise_explains:
         why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"

@@ -200,7 +200,7 @@ class LineMove:
 
 
 def damped(off: float, speed: float, stiffness: float, damping: float, t: float) -> tuple[float, float]:
-    """Return distance from rest and speed of ``x'' = -damping x' - stiffness x`` after `t` seconds."""
+    """Return displacement and velocity of ``x'' = -damping x' - stiffness x`` after `t` seconds."""
     half = damping / 2
     root = cmath.sqrt(half * half - stiffness) or 1e-9
     near, turned = cmath.cosh(root * t), cmath.sinh(root * t) / root

@@ -82,7 +82,7 @@ def export_plan(
 @simulate("Accepted for consistency; the functions do not change.")
 @JSON
 def urscript(first: int, example: bool, output: Path | None, simulate: bool, as_json: bool) -> Made:  # noqa: ARG001
-    """Write the functions with which a UR program uses `ftdrive serve-load`.
+    """Write the URScript functions through which a UR program uses `ftdrive serve-load`.
 
     The functions are ftd_zero, ftd_weigh, ftd_wrench, ftd_bias, ftd_alive, ftd_status and ftd_payload. Each has a
     time-out and returns a state, never an old value.

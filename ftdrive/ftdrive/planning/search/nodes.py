@@ -197,7 +197,7 @@ DIFFERENT_SHAPES = tuple(np.unique([row[1:3] for row in _TOUR_DEG], axis=0, retu
 
 # Any model serves, because the wrist angles of an orientation are the same for every nominal arm.
 _NOMINAL = MODELS["UR5e"]
-# Most by which wrist angles of a real arm, within 1.3 degrees of its nominal model, differ from the table of the tour.
+# Largest deviation of a real arm's wrist angles from the table of the tour, for arms within 1.3° of their model.
 _ROOM_RAD = float(np.radians(3))
 
 

@@ -33,7 +33,7 @@ class UrscriptSyntaxError(Exception):
 
 
 class NotEmulated(UrscriptSyntaxError):
-    """The text is URScript, which this emulator does not run."""
+    """The text is valid URScript that this emulator does not support."""
 
     def __init__(self, place: Place, what: str) -> None:
         sentence = f"{what} is valid URScript, not emulated here"

@@ -394,7 +394,7 @@ def test_to_the_cure_of_a_silence_belongs_how_to_see_who_answers(address: Sensor
     ("error", "address", "permission", "cure"),
     [
         (not_opened("the port does not open"), PORT, FORBIDDEN, "sudo usermod"),
-        (not_opened("does not open (13)", "plugged in?"), PORT, FORBIDDEN, "sudo usermod"),
+        (not_opened("cannot be opened (13)", "plugged in?"), PORT, FORBIDDEN, "sudo usermod"),
         (DeviceTimeout("silent for 0.4 s", "check cable and power"), PORT, FORBIDDEN, "sudo usermod"),
         (StreamBroken("the port is gone (x)", "plug it in"), PORT, FORBIDDEN, "sudo usermod"),
         (ConnectError("no port may be read"), PORT, FORBIDDEN, "sudo usermod"),
