@@ -127,7 +127,7 @@ class UrArm(RobotArm):
             self._connect(control)
         except (StreamBroken, DeviceTimeout, DeviceFault, ProtocolError) as error:
             self.close()
-            raise ConnectError(f"cannot open the arm at {self._host}: {error.found}", error.fix) from error
+            raise ConnectError(f"cannot connect to the arm at {self._host}: {error.found}", error.fix) from error
         except BaseException:
             self.close()
             raise

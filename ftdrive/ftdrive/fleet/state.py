@@ -40,7 +40,7 @@ class CellState:
     """Id of the newest accepted calibration."""
     verdict: str | None = None
     calibrated: datetime | None = None
-    """Time at which this newest calibration was made, UTC."""
+    """Time at which the newest calibration was made, UTC."""
     verified: datetime | None = None
     """Time of the last verification of this calibration, UTC."""
     passed: bool | None = None

@@ -570,7 +570,7 @@ def _rotations(form: str, numbers: Array) -> Array:
         return Rotation.from_quat(numbers).as_matrix()
     if (largest := float(length.max(initial=0.0))) > _MOST_RAD:
         raise BadDataset(
-            f"a rotation vector of {largest:.0f} rad is in degrees, or is three angles: give its unit, --columns "
+            f"a rotation vector of length {largest:.0f} is in degrees, or three Euler angles: give its unit, --columns "
             f'"rx=… [deg],ry=… [deg],rz=… [deg]", or add --euler xyz (base axes) or XYZ (tool axes)'
         )
     if largest > _LONGEST_VECTOR_RAD:

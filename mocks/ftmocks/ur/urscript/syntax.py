@@ -36,7 +36,7 @@ class NotEmulated(UrscriptSyntaxError):
     """The text is valid URScript that this emulator does not support."""
 
     def __init__(self, place: Place, what: str) -> None:
-        sentence = f"{what} is valid URScript, not emulated here"
+        sentence = f"{what} is valid URScript, but not emulated here"
         super().__init__(place, sentence, f"not_emulated_on_line:{place.line}:{what}:")
 
 

@@ -180,7 +180,7 @@ BROKEN: dict[str, tuple[str | bytes, str, TableOptions]] = {
     ),
     "rotation vector in degrees": (
         text(t(POSES) | wrench(POSES) | columns("rx ry rz", np.degrees(POSES.R.as_rotvec()))),
-        r"rotation vector of \d+ rad is in degrees, or is three angles: .*\[deg\].*--euler",
+        r"rotation vector of length \d+ is in degrees, or three Euler angles: .*\[deg\].*--euler",
         named(),
     ),
     "no row": (lines()[0], r"no row has two numbers or more", named()),

@@ -136,7 +136,7 @@ def test_errors_read_as_on_a_controller(text: str, place: tuple[int, int], repor
     ],
 )
 def test_what_is_urscript_is_not_called_an_error(text: str, place: tuple[int, int], what: str) -> None:
-    with pytest.raises(NotEmulated, match=f"{re.escape(what)} is valid URScript, not emulated here") as rejected:
+    with pytest.raises(NotEmulated, match=f"{re.escape(what)} is valid URScript, but not emulated here") as rejected:
         parse(text, "f", BUILT_IN)
     assert rejected.value.place == place
 
