@@ -154,7 +154,7 @@ class ToolConfig:
     )
     mass_kg: float | None = entry(
         "approximate mass below the sensor; compared with the controller's payload and the sensor's range; until six "
-        "poses are taken, it sets the limit for changes of the wrench",
+        "poses are taken, it sets the limit on changes in the wrench",
         None,
         "kg",
         (0.001, 100),
