@@ -126,7 +126,7 @@ def test_an_unplugged_sensor(station: Station, cell: Path, ftdrive: CommandLine)
     cell.write_text(cell.read_text().replace(station.cell.sensor.url, "ati-serial:///dev/unplugged"))
     outcome = ftdrive.run("doctor", "--config", cell, "--push", "--all")
     assert outcome.returncode == 7
-    assert "the port does not open" in outcome.stdout
+    assert "the port cannot be opened" in outcome.stdout
     assert "fix: plug the adapter in" in outcome.stdout
     assert "✔ remote control" in outcome.stdout
     assert "sensor.identity, permissions.port" in outcome.stderr

@@ -131,13 +131,13 @@ def test_a_cycle_and_then_a_failure(station: Station, failure: str) -> None:
         assert station.ask("state")["payload_kg"] == pytest.approx(1.0 + mass_kg)
         assert values(said(station, "unknown", since)) == [9]
         said(station, "watch", since)
-        begin_ns = station.clock.now_ns()
         if failure == "kill":
             service.signal(signal.SIGKILL)
         elif failure == "cable":
             station.ask("silent", what="rtde", on=True)
         else:
             station.ask("sensor-faults", stall=True)
+        begin_ns = station.clock.now_ns()  # a busy computer takes its time until the fault is there
         assert said(station, "lost", since)["t_host_ns"] - begin_ns <= LIMIT_NS
         assert values(said(station, "gone", since)) == [-1, 0, 0, 0, 0, 0, 0]
         assert values(said(station, "refused", since)) == [-1] + [0] * 9
