@@ -287,7 +287,7 @@ def test_forces_and_torques_in_other_units_are_named_where_only_their_ratio_show
 def test_rotation_vectors_in_degrees_are_refused(tmp_path: Path) -> None:
     rows = "\n".join(f"{90 - k},{k},0,1,2,3,4,5,6" for k in range(6))
     (tmp_path / "poses.csv").write_text(f"rx,ry,rz,fx,fy,fz,tx,ty,tz\n{rows}\n")
-    with pytest.raises(BadDataset, match="is in degrees, or is three angles"):
+    with pytest.raises(BadDataset, match="is in degrees, or three Euler angles"):
         read_dataset(tmp_path / "poses.csv")
 
 
