@@ -115,7 +115,7 @@ def test_poses_by_hand_and_topics_give_the_load(stack: ExitStack, tmp_path: Path
     said = []
     for line in session.stderr:
         said.append(line)
-        if match := re.match(r"\s+(\d+)/\d+ R\d+: settled", line):
+        if match := re.match(r"\s+(\d+)/\d+ R\d+: .*settled", line):
             process.stdin.write(json.dumps({"rest": int(match[1])}) + "\n")
             process.stdin.flush()
     assert session.wait(60) == 0, "".join(said)
